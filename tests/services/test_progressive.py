@@ -117,8 +117,9 @@ def test_a_progressive_call_leaves_its_job_in_no_cycle() -> None:
 
     async def test() -> None:
         call = Call("id", time.monotonic(), math.inf)
+        given: list[pb.LocalizeResponse] = []
         with suppress(Overloaded):
-            await service._answer(request, cast(Any, query), answer_frames_of(request), call, [].append)
+            await service._answer(request, cast(Any, query), answer_frames_of(request), call, given.append)
 
     gc.collect()
     gc.disable()

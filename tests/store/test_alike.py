@@ -3,13 +3,15 @@
 import hashlib
 from collections.abc import Iterator
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 from sqlalchemy import text
 from support.stores import Folder, Place, make_reference
 
 from mapless_server.security import SceneKey
-from mapless_server.store import Store
+from mapless_server.store import Store, codec
+from mapless_server.store.alike import find_alike
 from mapless_server.store.reader import ALIKE_MOST
 
 SCENE = SceneKey("hall")
@@ -54,6 +56,19 @@ def test_of_many_alike_references_few_are_read(store: Store) -> None:
     found = [it.reference_id for it in store.list_alike(SCENE, (), posed)]
     assert len(found) == ALIKE_MOST + 1
     assert "first" in found
+
+
+@pytest.mark.parametrize(("count", "statements"), [(0, 0), (1, 1), (9, 1), (64, 1), (100, 2)])
+def test_many_values_are_searched_for_in_few_statements(store: Store, count: int, statements: int) -> None:
+    """Each with a limit of its own, whichever way the last statement is filled."""
+    posed = [make_reference("", 10 + i) for i in range(MANY)]
+    values = [codec.encode_geometry(it.camera, it.world_from_camera) for it in posed]
+    values += [b"unknown %d" % i for i in range(100 - MANY)]
+    with store.database.read() as connection:
+        counting = Mock(wraps=connection)
+        found = {it.reference_id for it in find_alike(counting, SCENE, "geometry", values[:count], ALIKE_MOST)}
+    assert found == {f"r{i}" for i in range(min(count, MANY))}
+    assert counting.execute.call_count == statements
 
 
 def test_alike_references_are_found_by_an_index(place: Place) -> None:

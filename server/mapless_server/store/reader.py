@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial, wraps
 from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
 
-from sqlalchemy import Connection, Row, Select, bindparam, select
+from sqlalchemy import Connection, Row, Select, select
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.cache import LruCache
@@ -15,6 +15,7 @@ from mapless_server.errors import AlreadyExists, NotFound, RequestError
 from mapless_server.security import SceneKey
 
 from . import codec, queries, rows, tables
+from .alike import find_alike
 from .database import DamagedPages, Database, unavailable, unless_damaged
 from .queries import read_changes
 from .records import DescribedReference, ReferenceRecord, SceneAttributes, SceneChanges, SceneRecord, SceneSnapshot
@@ -35,11 +36,6 @@ ALIKE_MOST = 10
 would be the whole scene where a tracker gave every photograph its start. In a scene of 10,000 a search costs 0.6 ms of
 processor time for one reference, and 0.3 for each of a hundred (`research.equal_references`)."""
 
-_IN_SCENE = select(tables.reference).where(tables.reference.c.scene_id == bindparam("scene_key")).limit(ALIKE_MOST)
-_BY_IMAGE, _BY_GEOMETRY = (
-    _IN_SCENE.where(column == bindparam("value"))
-    for column in (tables.reference.c.image_sha256, tables.reference.c.geometry)
-)
 
 UNWRITABLE = frozenset({"STORE_READ_ONLY", "STORE_FULL", "STORE_UNAVAILABLE"})
 """Reasons of faults after which the next change would most likely fail, too."""
@@ -226,17 +222,16 @@ class StoreReader:
     def list_alike(
         self, scene_key: SceneKey, images_sha256: Collection[str], posed: Sequence[tuple[Camera, RigidTransform]]
     ) -> list[ReferenceRecord]:
-        """References with one of these images, or one of these cameras and poses; `ALIKE_MOST` of each.
+        """References with one of these images, or one of these cameras and poses; any `ALIKE_MOST` of each.
 
         Ordered by id. DataLoss if camera and pose of one of them are damaged.
         """
         geometries = {codec.encode_geometry(*it) for it in posed}
         found: dict[str, Row[Any]] = {}
         with self.database.read() as connection:
-            for statement, values in ((_BY_IMAGE, images_sha256), (_BY_GEOMETRY, geometries)):
-                for value in values:
-                    alike = connection.execute(statement, {"scene_key": scene_key, "value": value})
-                    found |= {row.reference_id: row for row in alike}
+            for column, values in (("image_sha256", images_sha256), ("geometry", geometries)):
+                alike = find_alike(connection, scene_key, column, list(values), ALIKE_MOST)
+                found |= {row.reference_id: row for row in alike}
         return [rows.reference_record(found[it]) for it in sorted(found)]
 
     @observed
