@@ -38,7 +38,10 @@ def test_a_server_that_is_away_is_said_once(capsys: pytest.CaptureFixture[str]) 
 def test_an_address_that_is_silent_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"127.0.0.1:{silent.getsockname()[1]}"
-        with WaitingClient(address, ConnectOptions(timeout_s=2.5), "tool") as client, pytest.raises(MaplessError):
+        with (
+            WaitingClient(address, ConnectOptions(timeout_s=2.5), "tool") as client,
+            pytest.raises(MaplessError, match=f"no connection to {address} in time"),
+        ):
             client.get_scene("s")
     assert capsys.readouterr().err.startswith(f"tool: no connection to {address} yet; trying for up to ")
 

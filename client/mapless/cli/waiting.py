@@ -10,7 +10,7 @@ import grpc
 from google.protobuf.message import Message
 
 from ..client import Client
-from ..errors import MaplessError, is_unconnected
+from ..errors import DeadlineExceeded, MaplessError, is_unconnected
 from ..options import ConnectOptions
 
 NOTICE_S = 2.0
@@ -44,6 +44,11 @@ class WaitingClient(Client):
         timer.start()
         try:
             response = await super()._response(method, request, timeout_s)
+        except DeadlineExceeded as error:
+            if not error.request_id and not self._is_connected():
+                error.message = f"no connection to {self.address} in time"
+                error.args = (f"{error.reason}: {error.message}",)
+            raise
         finally:
             timer.cancel()
         with self._lock:
@@ -58,8 +63,12 @@ class WaitingClient(Client):
         await super()._pause(duration_s, error)
 
     def _say_if_unconnected(self) -> None:
-        if not any(map(_is_connected, (it.channel for it in self._servers.all))):
+        if not self._is_connected():
             self._say(f"no connection to {self.address} yet")
+
+    def _is_connected(self) -> bool:
+        """Whether there is a connection to one of the servers now."""
+        return any(map(_is_connected, (it.channel for it in self._servers.all)))
 
     def _say(self, what: str, until_s: float = math.inf) -> None:
         with self._lock:
