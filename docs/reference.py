@@ -21,6 +21,7 @@ from google.protobuf import descriptor_pb2
 from mapless import errors as client_errors
 from mapless.cli.arguments import all_parsers, make_parser
 from mapless_server import errors, settings
+from mapless_server.method.ladder import RUNGS
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Refusal
 from mapless_tools.cli.app import app
@@ -39,6 +40,13 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 def first_paragraph(documented: Any) -> str:
     """The first paragraph of a docstring, on one line."""
     return " ".join((documented.__doc__ or "").strip().split("\n\n")[0].split())
+
+
+def ladder_table() -> str:
+    """The rungs of the ladder in order."""
+    head = ["rung", "changes", "tried on", "needs", "computes again"]
+    doubts = {it.name: ", ".join(str(doubt.name) for doubt in it.doubts) for it in RUNGS}
+    return table(head, [[it.name, it.changes, doubts[it.name], it.needs, it.cost] for it in RUNGS])
 
 
 # Settings
@@ -250,6 +258,7 @@ def _link(name: str, page: str) -> str:
 
 GENERATORS: dict[str, Callable[[], str]] = {
     "settings": settings_table,
+    "ladder": ladder_table,
     "errors": errors_table,
     "reasons": reasons_table,
     "metrics": metrics_table,

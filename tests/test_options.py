@@ -7,7 +7,7 @@ import pytest
 
 NAN = float("nan")
 OUTSIDE: dict[str, list[tuple[str, Any]]] = {
-    "engine.options.EscalationOptions": [("doubtful_trust", -1.0), ("doubtful_radius_m", NAN)],
+    "method.options.DoubtOptions": [("trust", -1.0), ("radius_m", NAN), ("inliers", -1)],
     "method.bundle.pose_problem.AdjustOptions": [("max_error_px", 0.0), ("iterations", 0), ("loss_scale_sigma", -1.0)],
     "method.coarse.grids.GridOptions": [("pixel_limit", 10), ("aspects", ()), ("max_stretch", 0.9)]
     + [("max_half_field_deg", 90)],

@@ -11,6 +11,7 @@ from itertools import combinations
 from statistics import median
 
 from mapless_server.cache import LruCache
+from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.nearest import mutual_matches
 from mapless_server.method.judge.answer import Answer
@@ -64,8 +65,7 @@ def measured(overlay: Overlay) -> Mapping[str, float]:
 
     answer: Answer = localize(query, references, pipeline, LocalizeOptions())
     support = answer.support
-    assert support is not None
-    assert support.estimate is not None
+    assert isinstance(support, PosedSupport)
     return {
         "evidence of a query": cost_ms(lambda: unmoved_failure(support, 12.0, OPTIONS)),
         "the first query of these references": cost_ms(first),

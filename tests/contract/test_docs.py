@@ -130,7 +130,7 @@ def test_architecture_names_types_that_exist() -> None:
     paths = (*SERVER.rglob("*.py"), *CLIENT.glob("*.py"), *(ROOT / "proto").rglob("*.proto"))
     sources = "".join(path.read_text() for path in paths)
     named = set(re.findall(r"`([A-Z][a-z]\w+)`", text))
-    assert {"QueryRun", "LocalizeRequest"} <= named
+    assert {"Search", "LocalizeRequest"} <= named
     assert sorted(name for name in named if not re.search(rf"(class|message|rpc) {name}\b", sources)) == []
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from support.images import encode, textured
 from support.planted_engine import (
+    DOUBT,
     DOUBTFUL_INLIERS,
-    ESCALATION,
     FEATURES,
     NEAR_ORIGIN,
     PIXELS,
@@ -32,7 +32,8 @@ from support.servers import CAMERA, PHOTO, StandInExtractor, pose, whole
 
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import QueryJob, Result, Tier
+from mapless_server.engine.query import Result, Tier
+from mapless_server.engine.search import SearchJob
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.errors import InvalidArgument, Unavailable
 from mapless_server.method.features.views import PosedView, View
@@ -91,13 +92,14 @@ class TestTiers:
         usual = JudgeOptions()
         assert setting.judges == [usual.with_trust(quantiles), usual, usual]
 
-    def test_contradicting_poses_are_rejected_by_name(self, setting: Setting) -> None:
+    def test_contradicting_poses_are_both_hypotheses(self, setting: Setting) -> None:
         near, far = localized(DOUBTFUL_INLIERS), localized(DOUBTFUL_INLIERS, at=pose(3.0))
         setting.replies = {"cheap": near, "strong": far}
         outcome = setting.localize().answer.outcome
         assert isinstance(outcome, Rejection)
-        assert outcome.reason is RejectionReason.GATE
-        assert outcome.message.startswith("the features disagree: the pose of cheap (5 inliers) and that of strong (5)")
+        assert outcome.reason is RejectionReason.AMBIGUOUS
+        assert outcome.message.startswith("two poses 3.00 m and 17 degrees apart explain the photograph")
+        assert [it.inlier_count for it in outcome.hypotheses] == [DOUBTFUL_INLIERS] * 2
 
     def test_a_rejection_of_the_engine_has_a_hint(self, setting: Setting) -> None:
         """Where tiers disagree, a pose contradicts the prior, a tier fails, or there are no references."""
@@ -145,7 +147,8 @@ class TestTiers:
         answered.set()
         assert result.tier.extractor.name == "cheap"
         assert isinstance(result.answer.outcome, Localization)
-        assert list(result.stage_seconds) == ["decode", "features", "coarse", "strong/unfinished"]
+        assert [(it.rung, it.outcome) for it in result.attempts][-1] == ("stronger", "unfinished")
+        assert [it.is_chosen for it in result.attempts].index(True) == 0
 
     def test_no_answer_is_lost_because_a_better_one_fails(
         self, setting: Setting, caplog: pytest.LogCaptureFixture
@@ -156,8 +159,8 @@ class TestTiers:
         setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": failing}
         result = setting.localize()
         assert result.tier.extractor.name == "cheap"
-        assert list(result.stage_seconds)[-1] == "strong/unfinished"
-        assert "strong failed" in caplog.text
+        assert (result.attempts[-1].features, result.attempts[-1].outcome) == ("strong", "failed")
+        assert "the attempt 'stronger' failed" in caplog.text
         assert "out of memory, say" in caplog.text
 
     def test_stronger_features_wait_where_calls_come_together(
@@ -184,12 +187,12 @@ class TestTiers:
 
         setting.replies["strong"] = unavailable
         assert hint_of(setting.localize()).message == (
-            f"{advice} Trying it with strong features was not finished: asking again, when less is asked, may help."
+            f"{advice} Trying it with stronger features was not finished: asking again, when less is asked, may help."
         )
 
     def test_a_search_that_is_given_up_leaves_the_first_answer(self, setting: Setting) -> None:
         tried = whole(lambda *_: rejected())
-        stages = QueryStages(setting.engine.tiers, ESCALATION, tried, lambda run: run.tier == 1)
+        stages = QueryStages(setting.engine.tiers, DOUBT, tried, lambda search: search.attempt.features == 1)
         job = setting.engine.query_job(query_of(("r0", "r1")), caller())
         while True:
             (result,) = getattr(stages, job.step.stage)([job])
@@ -197,8 +200,8 @@ class TestTiers:
                 break
             job.step = result.steps[0]
         assert result.value.tier.extractor.name == "cheap"
-        assert "strong features was not finished" in hint_of(result.value).message
-        assert list(result.value.stage_seconds)[-1] == "strong/unfinished"
+        assert "stronger features was not finished" in hint_of(result.value).message
+        assert result.value.attempts[-1].outcome == "unfinished"
 
     def test_a_better_answer_never_waits_for_feature_extraction(self, setting: Setting) -> None:
         """It is done after the call, once, and the next doubtful query has the better answer."""
@@ -213,7 +216,7 @@ class TestTiers:
             names.append(result.tier.extractor.name)
             if names[-1] == "strong":
                 break
-            assert list(result.stage_seconds)[-1] == "strong/unfinished"
+            assert result.attempts[-1].outcome == "unfinished"
             time.sleep(0.02)
         assert names[0] == "cheap"
         assert names[-1] == "strong"
@@ -236,7 +239,7 @@ class TestMemory:
         setting.replies["cheap"] = localized(SURE_INLIERS)
         run, sizes = setting.engine.queue.run, list[int]()
 
-        def noted(job: QueryJob) -> Any:
+        def noted(job: SearchJob) -> Any:
             sizes.append(job.size_bytes)
             return run(job)
 
@@ -308,7 +311,7 @@ class TestPhotograph:
         else:
             result = setting.localize(reference_ids=())
             assert result.tier.extractor.name == "cheap"
-            assert list(result.stage_seconds)[-1] == "strong/unfinished"
+            assert result.attempts[-1].outcome == "failed"
         assert setting.asked.count(tier) == MAX_LISTINGS
 
 

@@ -7,12 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.planted_engine import ESCALATION, SURE_INLIERS, Setting, caller, localized, query_of, rejected
+from support.planted_engine import DOUBT, SURE_INLIERS, Setting, caller, localized, query_of, rejected
 from support.servers import whole
 
+from mapless_server.engine.search import SearchStep
 from mapless_server.engine.stages import QueryStages
+from mapless_server.method.attempt import Attempt
 from mapless_server.method.features.views import Matches, View
 from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.scheduling import CostModel, Next
 
@@ -31,12 +34,19 @@ class OneMatch:
         return np.array([[0, self.calls]], np.int32)
 
 
+def rematched(step: SearchStep) -> SearchStep:
+    """The first step of matching by the network, with nothing tried before."""
+    attempt = Attempt(1, matching=Matching.STRONG)
+    return replace(step, payload=replace(step.payload, rung="rematched", attempt=attempt))
+
+
 class TestRematching:
     """The strong tier matches a doubtful photograph again, by a slow network, with one reference after another."""
 
     def pair_matching(self, setting: Setting, seconds: float = 0.0) -> OneMatch:
-        setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
         planted = setting.engine.tiers[1].pipeline.matcher.pairs.pair_matching = OneMatch(seconds)
+        found = lambda *_: localized(SURE_INLIERS) if planted.calls else rejected()  # noqa: E731
+        setting.replies = {"cheap": rejected(), "strong": found}
         return planted
 
     @pytest.mark.parametrize("chooses", [False, True])
@@ -44,7 +54,8 @@ class TestRematching:
         planted = self.pair_matching(setting)
         result, job = setting.run(query_of(() if chooses else ("r0", "r1")), caller())
         assert planted.calls == 2
-        assert [it.stage for it in job.records].count("prepare") == 1 + 1 + 2
+        assert [it.stage for it in job.records].count("prepare") == 1 + 1 + 1 + 2
+        assert [it.rung for it in result.attempts if it.is_chosen] == ["rematched"]
         assert result.stage_seconds["strong/rematch"] >= 0
         assert result.tier.extractor.name == "strong"
 
@@ -52,15 +63,16 @@ class TestRematching:
     def test_alone_as_many_pairs_as_threads_are_a_step(self, setting: Setting, is_alone: bool, steps: int) -> None:
         planted = self.pair_matching(setting)
         tier = replace(setting.engine.tiers[1], pipeline=Pipeline(matcher=Matcher(threads=2, pair_matching=planted)))
-        stages = QueryStages([setting.engine.tiers[0], tier], ESCALATION, is_alone=lambda: is_alone)
+        stages = QueryStages([setting.engine.tiers[0], tier], DOUBT, is_alone=lambda: is_alone)
         job = setting.engine.query_job(query_of(("r0", "r1")), caller())
-        job.step.payload.__dict__["tier"] = 1
+        job.step = rematched(job.step)
         (chosen,) = stages.prepare([job])
         assert isinstance(chosen, Next)
-        run = chosen.steps[0].payload
+        search = chosen.steps[0].payload
         for _ in range(steps):
-            run = stages._rematched(run)
-        assert not run.unmatched
+            search = stages._rematched(search)
+        assert search.material is not None
+        assert not search.material.unmatched
         assert planted.calls == 2
 
     def test_the_method_gets_the_new_matches(self, setting: Setting) -> None:
@@ -72,9 +84,9 @@ class TestRematching:
             got.append(arguments[5])
             return usual.prepare(*arguments)
 
-        stages = QueryStages(setting.engine.tiers, ESCALATION, replace(usual, prepare=prepare))
+        stages = QueryStages(setting.engine.tiers, DOUBT, replace(usual, prepare=prepare))
         job = setting.engine.query_job(query_of(("r0", "r1")), caller())
-        job.step.payload.__dict__["tier"] = 1
+        job.step = rematched(job.step)
         steps = 0
         while job.step.stage == "prepare":
             (done,) = stages.prepare([job])
@@ -104,7 +116,7 @@ class TestRematching:
         setting.engine.tiers[1].pipeline.matcher.pair_s = 8.0
         cost_s = {"prepare": 0.1, "coarse": 0.5, "refine": 9.0}
         monkeypatch.setattr(
-            CostModel, "predict", lambda _, stage, kind, *__: 8.0 if "rematch" in kind else cost_s[stage]
+            CostModel, "predict", lambda _, stage, kind, *__: 8.0 if kind.endswith("rematch") else cost_s[stage]
         )
         result = setting.localize(deadline_s)
         assert result.tier.extractor.name == "strong"

@@ -13,7 +13,7 @@ from support.corner import CAMERA, photograph, pose
 from support.images import encode, textured
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.engine import stages
+from mapless_server.engine import choosing
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import TRACK, Caller, Query, Result, Tier
@@ -191,7 +191,7 @@ def test_a_search_elsewhere_that_fails_costs_no_answer(localize: Localize, monke
     def fails(*_: object) -> bool:
         raise DataLoss("damaged")
 
-    monkeypatch.setattr(stages, "may_be_elsewhere", fails)
+    monkeypatch.setattr(choosing, "_outside", fails)
     assert isinstance(localize(prior(TRUE.shifted(AWAY_M)), TWO_PLACES).answer.outcome, Rejection)
     localized(localize(Priors(position=PositionPrior(TRUE.translation, np.eye(3)))))
 

@@ -18,15 +18,15 @@ from support.images import encode, textured
 
 from mapless.axes import turned_raster
 from mapless.geometry import Camera
-from mapless_server.engine import choosing, stages
-from mapless_server.engine.choosing import turned_to_match
-from mapless_server.engine.options import EngineOptions, EscalationOptions
-from mapless_server.engine.photos import Photo, QueryViews
-from mapless_server.engine.query import TURN, Caller, Query, QueryRun, Result, Tier
+from mapless_server.engine import choosing
+from mapless_server.engine.options import EngineOptions
+from mapless_server.engine.photos import Photo, QueryViews, RasterForm
+from mapless_server.engine.query import TURN, Caller, Query, Result, Tier
+from mapless_server.engine.search import Search
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.views import Ignored, View, view_of
-from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.judge.answer import Localization
+from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.scenes import ANYWHERE, Narrowing, Sphere
@@ -83,7 +83,7 @@ def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
 def localizing(folder: Path, tiers: Sequence[Tier], doubtful_trust: float = 0.25) -> Iterator[Localize]:
     caller, loop = Caller(Flow("tenant", "client"), time.monotonic() + 600), asyncio.new_event_loop()
     with Store.open(folder) as store:
-        options = EngineOptions(escalation=EscalationOptions(doubtful_trust))
+        options = EngineOptions(doubt=DoubtOptions(doubtful_trust))
         engine = engine_over(store, tiers, options)
         photos = [Photo(photograph(it), CAMERA, "image") for it in REFERENCE_POSES]
         described = loop.run_until_complete(engine.describe(photos, caller))
@@ -176,18 +176,17 @@ def test_turned_or_mirrored_is_what_matches_clearly_more(
 ) -> None:
     """Half as much again as all else; mirrored moreover not by chance, as 45 of 65 matches may be."""
 
-    def planted(run: QueryRun, tier: Tier) -> tuple[int, str]:
-        by_turns = {0: upright, 1: turned}.get(run.views.quarter_turns, 0)
-        return (mirrored if run.views.is_mirrored else by_turns), "r3"
+    def planted(search: Search, views: QueryViews, tier: Tier) -> tuple[int, str]:
+        by_turns = {0: upright, 1: turned}.get(views.form.quarter_turns, 0)
+        return (mirrored if views.form.is_mirrored else by_turns), "r3"
 
     monkeypatch.setattr(choosing, "_most_matches", planted)
     photo = Photo(photograph(TRUE), CAMERA, "image")
     query = Query(SCENE, NAMED, photo, ANYWHERE, 8, LocalizeOptions())
-    run = QueryRun(query, cast(Any, None), QueryViews(photo, ImageLimits()), time.monotonic() + 60)
-    found = turned_to_match(run, Tier(UprightSift(), Pipeline()))
+    search = Search.begin(query, cast(Any, None), QueryViews(photo, ImageLimits()), time.monotonic() + 60)
+    found = choosing.turned_to_match(search, Tier(UprightSift(), Pipeline()))
     if used is not None:
-        assert isinstance(found, QueryViews)
-        assert (found.quarter_turns, found.is_mirrored) == (used, False)
+        assert found == RasterForm(quarter_turns=used)
     else:
         assert isinstance(found, Rejection)
         assert found.hint is not None
@@ -204,11 +203,7 @@ def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:
 
 def test_a_turn_that_shows_no_more_is_not_searched_further(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Matches by chance may be clearly more in a turned raster; stronger features still get the photograph as it is."""
-
-    def turned(run: QueryRun, tier: Tier) -> QueryViews:
-        return run.views.turned(1, run.context)
-
-    monkeypatch.setattr(stages, "turned_to_match", turned)
+    monkeypatch.setattr(choosing, "turned_to_match", lambda search, tier: RasterForm(quarter_turns=1))
     first = Blind()
     tiers = [Tier(first, Pipeline(), upright_only=True), Tier(UprightSift(), Pipeline(), upright_only=True)]
     with localizing(tmp_path, tiers) as answer:
@@ -216,15 +211,3 @@ def test_a_turn_that_shows_no_more_is_not_searched_further(tmp_path: Path, monke
         result = answer(photograph(TRUE), CAMERA)
     assert isinstance(result.answer.outcome, Localization)
     assert result.tier.features == "upright-sift"
-
-
-def test_time_of_several_searches_with_one_tier_adds_up() -> None:
-    result = Result(
-        Answer(Rejection(RejectionReason.LOW_OVERLAP, "planted")), Tier(UprightSift(), Pipeline()), (), 1, CAMERA
-    )
-    searched = replace(result, stage_seconds={"features": 1.0, "sift/features": 2.0})
-    assert searched.seconds_with({"sift/features": 0.5, "sift/turn": 0.25}) == {
-        "features": 1.0,
-        "sift/features": 2.5,
-        "sift/turn": 0.25,
-    }

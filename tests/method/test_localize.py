@@ -24,7 +24,7 @@ from support.planted import moved_references
 from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
-from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage
+from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from mapless_server.method.bundle.radii import JACKKNIFE_SHARE, accuracy_from_covariance, with_halves
 from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.judge.evidence import evidence_of, votes_of
@@ -132,8 +132,7 @@ def test_radii_contain_the_distance_of_halves() -> None:
         scene = make_scene(random_for("apart", seed), SceneOptions(point_count=150, outlier_share=0.5))
         answer = localize(scene.query, scene.references, pipeline_of("geometric", scene), LocalizeOptions(coverage=1.0))
         found, support = pose_of(answer), answer.support
-        assert support is not None
-        assert support.estimate is not None
+        assert isinstance(support, PosedSupport)
         assert support.estimate.intrinsics is not None
         assert found.covariance is not None
         votes = votes_of(support, support.query_matches)
@@ -200,9 +199,9 @@ def test_a_weak_answer_is_recomputed_from_wide_correspondences(monkeypatch: pyte
         return correspond(self, query, references, matching, check, query_matches)
 
     monkeypatch.setattr(Matcher, "correspond", spy)
-    strong = pose_of(answer_of(weak_below(10, pipeline_of("geometric"))))
+    strong = pose_of(answer_of(pipeline_of("geometric"), doubt=weak_below(10)))
     assert asked == [Matching.STRICT]
-    again = answer_of(weak_below(10**6, pipeline_of("geometric")))
+    again = answer_of(pipeline_of("geometric"), doubt=weak_below(10**6))
     assert asked == [Matching.STRICT, Matching.STRICT, Matching.WIDE]
     assert pose_of(again).inlier_count >= strong.inlier_count
     assert list(again.stage_seconds) == ["correspond", "coarse", "scale", *LATER_STAGES, "adjust", *JUDGED]
@@ -210,7 +209,7 @@ def test_a_weak_answer_is_recomputed_from_wide_correspondences(monkeypatch: pyte
 
     for variant in (Variant.COARSE, Variant.NO_STRUCTURE, Variant.FULL):  # the paper's forms stay the paper's
         asked.clear()
-        answer_of(weak_below(10**6, pipeline_of("geometric")), LocalizeOptions(variant))
+        answer_of(pipeline_of("geometric"), LocalizeOptions(variant), doubt=weak_below(10**6))
         assert asked == [Matching.STRICT]
 
 

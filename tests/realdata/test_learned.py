@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapless_server.engine.options import EscalationOptions
 from mapless_server.engine.query import Tier
-from mapless_server.engine.tiers import is_doubtful
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.views import PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.judge.hypothesis import doubts_of
+from mapless_server.method.ladder import STRENGTHENED
 from mapless_server.method.localize import localize
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.serve.assembly import make_tiers
 from mapless_server.settings import Settings
 from mapless_tools.dataset import Dataset
@@ -45,7 +45,7 @@ def test_strong_features_localize_what_cheap_ones_reject(
     photographs: Callable[[str], Dataset], tiers: tuple[Tier, ...]
 ) -> None:
     cheap, strong = (answers(photographs(SCENE), tier) for tier in tiers)
-    doubtful = [is_doubtful(answer, EscalationOptions()) for answer in cheap]
+    doubtful = [bool(doubts_of(answer, DoubtOptions()) & STRENGTHENED) for answer in cheap]
     assert doubtful == [False, True, True]
     assert not isinstance(cheap[2].outcome, Localization)
     assert [error_m(photographs(SCENE), *pair) < 0.05 for pair in zip(QUERIES, strong, strict=True)] == [True] * 3

@@ -32,8 +32,9 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import QueryJob, Result, Tier
+from mapless_server.engine.query import Result, Tier
 from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.engine.search import SearchJob
 from mapless_server.engine.stages import Method
 from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.judge.answer import Answer, Localization
@@ -71,7 +72,7 @@ async def test_the_real_method_localizes_the_rendered_scene(tmp_path: Path) -> N
     async with warm(tmp_path, make_tiers(Settings(data_dir=tmp_path))) as engine:
         run = engine.run
 
-        async def watched(job: QueryJob) -> Result:
+        async def watched(job: SearchJob) -> Result:
             results.append(await run(job))
             return results[-1]
 

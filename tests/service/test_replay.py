@@ -37,6 +37,8 @@ from mapless import (
     SequenceFrame,
 )
 from mapless.geometry import RigidTransform as Pose
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.method.attempt import Attempt
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call, encode_call
 from mapless_server.services.capture.files import blob_path, calls_of
 from mapless_server.settings import load_settings
@@ -310,22 +312,15 @@ def test_a_replay_that_is_not_possible_is_refused(captured: Path, arguments: lis
 
 
 @pytest.mark.parametrize(
-    ("stages", "tier", "before", "is_given_up"),
-    [
-        (("pnp", "strong/unfinished"), 1, ("pnp",), True),
-        (("pnp", "strong/unfinished"), 0, ("pnp",), False),
-        (("pnp", "cheap/unfinished"), 0, ("pnp",), True),
-        (("pnp", "cheap/pnp", "cheap/unfinished"), 0, ("pnp",), False),
-        (("pnp", "cheap/pnp", "cheap/unfinished"), 0, ("pnp", "cheap/pnp"), True),
-        (("pnp", "cheap/pnp"), 0, ("pnp",), False),
-    ],
+    ("rung", "features", "is_given_up"),
+    [("stronger", 1, True), ("stronger", 0, False), ("wide", 1, False), ("lines", 1, False)],
 )
-def test_searches_that_had_no_time_are_given_up_again(
-    stages: tuple[str, ...], tier: int, before: tuple[str, ...], is_given_up: bool
-) -> None:
+def test_attempts_that_had_no_time_are_given_up_again(rung: str, features: int, is_given_up: bool) -> None:
+    ended = [("wide", "strong", "gate"), ("stronger", "strong", "unfinished")]
+    then = pb.Diagnostics(attempts=[pb.Attempt(rung=r, features=f, outcome=o) for r, f, o in ended])
     tiers: Any = [SimpleNamespace(features=it) for it in ("cheap", "strong")]
-    run: Any = SimpleNamespace(tier=tier, best=SimpleNamespace(stage_seconds=dict.fromkeys(before, 0.1)))
-    assert given_up(stages, tiers)(run) == is_given_up
+    search: Any = SimpleNamespace(rung=rung, attempt=Attempt(features))
+    assert given_up(then, tiers)(search) == is_given_up
 
 
 def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -59,14 +59,14 @@ def traced() -> Iterator[Tracer]:
     try:
         yield tracer
     finally:
-        threading.setprofile(before[0])  # type: ignore[arg-type]
+        threading.setprofile(before[0])
         sys.setprofile(before[1])
 
 
 def test_files_of_engine_and_method_in_a_warm_localize(tmp_path: Path) -> None:
     place = room()
     query = place.queries[0]
-    settings = {"features": "sift", "backend": "geometric", "background_matching": False}
+    settings: dict[str, Any] = {"features": "sift", "backend": "geometric", "background_matching": False}
     with (
         traced() as tracer,
         serving_really(tmp_path, **settings) as server,

@@ -13,7 +13,7 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Fisheye, RadialTangential
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
+from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage, Support
 from mapless_server.method.features.views import Photograph, PosedView, View
 from mapless_server.method.pose.pnp import PnpOptions
 from mapless_server.services.messages.debug import MAX_MATCHES, debug_to_message
@@ -50,7 +50,8 @@ def support_of(
         errors = matches.seen(query, structure.x_in_world).errors_px(world_from_query)
         inliers = errors < PnpOptions().inlier_px
         estimate = PoseEstimate(world_from_query, PoseStage.REFINED, inliers, errors, np.eye(6))
-    return Support(query, references, structure, matches, estimate, ORIGIN)
+    support = Support(query, references, structure, matches, ORIGIN)
+    return support if estimate is None else support.posed(estimate)
 
 
 def columns(*values: object) -> Array:
@@ -125,7 +126,7 @@ def test_without_a_pose_nothing_agrees_and_errors_are_unknown() -> None:
 def test_where_there_are_too_many_the_inliers_stay() -> None:
     scene = make_scene(random_for("debug many"), SceneOptions(point_count=4000, reference_count=3))
     support = support_of(scene, SENT, scene.world_from_query, wrong_count=1500)
-    assert support.estimate is not None
+    assert isinstance(support, PosedSupport)
     inliers = int(support.estimate.inliers.sum())
     debug = debug_to_message(support)
     assert inliers < MAX_MATCHES < len(support.matches)

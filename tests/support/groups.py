@@ -97,7 +97,7 @@ def images_of(
         point[wrong] = np.roll(point[wrong], 1)
         matches = PointMatches(point, keypoint, np.zeros(len(point), bool), 6.0)
         its_matches = matches_with_references(structure, matches, len(scene.references))
-        support = Support(view, scene.references, structure, matches, None, ORIGIN, query_matches=its_matches)
+        support = Support(view, scene.references, structure, matches, ORIGIN, query_matches=its_matches)
         outcome: Localization | Rejection = NOT_ALONE
         if is_posed:
             off = pose.shifted(ORIGIN + random.normal(0, own_noise_m, 3))

@@ -13,9 +13,9 @@ from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.features.views import Features, PosedView, Reconstruction, View
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import localize
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.method.pairs.correspond import Matcher
-from mapless_server.method.pipeline import Pipeline, StageOptions
+from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from support.fake_network import FakeNetwork, FakeNetworkOptions
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for, unit_rows
@@ -61,8 +61,13 @@ def pipeline_of(backend: str, scene: SyntheticScene = SCENE, options: FakeNetwor
     return Pipeline(reconstructor, MATCHER if scene is SCENE else Matcher())
 
 
-def answer_of(pipeline: Pipeline, options: LocalizeOptions | None = None, query: View | None = None) -> Answer:
-    return localize(query or SCENE.query, SCENE.references, pipeline, options or LocalizeOptions())
+def answer_of(
+    pipeline: Pipeline,
+    options: LocalizeOptions | None = None,
+    query: View | None = None,
+    doubt: DoubtOptions = DoubtOptions(),  # noqa: B008  frozen
+) -> Answer:
+    return localize(query or SCENE.query, SCENE.references, pipeline, options or LocalizeOptions(), doubt=doubt)
 
 
 def pose_of(answer: Answer) -> Localization:
@@ -89,8 +94,9 @@ def fewer_features(seed: int) -> View:
     return replace(SCENE.query, features=Features(f.keypoints[kept], f.descriptors[kept], f.sizes_px[kept]))
 
 
-def weak_below(weak_inliers: int, pipeline: Pipeline) -> Pipeline:
-    return replace(pipeline, options=StageOptions(weak_inliers=weak_inliers))
+def weak_below(inliers: int) -> DoubtOptions:
+    """Poses with fewer inliers are doubtful, and no others."""
+    return DoubtOptions(0.0, np.inf, inliers)
 
 
 def blinded(reconstruction: Reconstruction) -> Reconstruction:

@@ -9,15 +9,16 @@ from typing import Any, cast
 import numpy as np
 
 from mapless.geometry import RigidTransform
-from mapless_server.engine.options import EngineOptions, EscalationOptions
+from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Description, Photo
-from mapless_server.engine.query import Caller, Query, QueryJob, Result, Tier
+from mapless_server.engine.query import Caller, Query, Result, Tier
+from mapless_server.engine.search import SearchJob
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.features.views import Features, PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.judge import JudgeOptions
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Hint, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing, Sphere
@@ -28,7 +29,7 @@ from mapless_server.store import Store
 from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
-ESCALATION = EscalationOptions(doubtful_trust=0.1, doubtful_radius_m=0.2)
+DOUBT = DoubtOptions(trust=0.1, radius_m=0.2, inliers=0)
 
 
 SCENE = SceneKey("s")
@@ -86,7 +87,7 @@ class Setting:
 
         self.tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
         self.engine = engine_over(
-            self.store, self.tiers, EngineOptions(escalation=ESCALATION), None, None, whole(method), DESCRIPTOR
+            self.store, self.tiers, EngineOptions(doubt=DOUBT), None, None, whole(method), DESCRIPTOR
         )
         self.loop = asyncio.new_event_loop()
 
@@ -103,7 +104,7 @@ class Setting:
         query = Query(SCENE, photo=Photo(PHOTO, CAMERA, "image"), options=LocalizeOptions(), **values)
         return self.run(query, caller(deadline_s))[0]
 
-    def run(self, query: Query, caller: Caller) -> tuple[Result, QueryJob]:
+    def run(self, query: Query, caller: Caller) -> tuple[Result, SearchJob]:
         job = self.engine.query_job(query, caller)
         return self.loop.run_until_complete(self.engine.run(job)), job
 

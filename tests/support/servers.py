@@ -24,12 +24,14 @@ from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
+from mapless_server.method.attempt import Attempt, Solver
 from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.features.views import Features, Ignored, PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.judge.hypothesis import Found, found_by
+from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.rejection import Rejection
+from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.structure.model import MetricScale, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Abandoned
@@ -167,13 +169,16 @@ def whole(localize: Callable[..., Answer]) -> Method:
         *asked, context, _, _, _ = arguments  # query matches, priors and unit do not matter
         return SimpleNamespace(asked=asked, context=context, bucket="stand-in", prepared=None)
 
-    def refine(coarse: Any) -> Answer:
-        return localize(*coarse.asked, coarse.context.check)
+    def solve(coarse: Any, attempt: Attempt, doubt: DoubtOptions) -> Found:
+        """Wide matches, lines and priors change nothing, so they find nothing else."""
+        if attempt.but(matching=attempt.matching.narrow, solver=Solver.POINTS, uses_priors=True) != attempt:
+            return found_by(attempt, Answer(Rejection(RejectionReason.LOW_OVERLAP, "planted")), doubt)
+        return found_by(attempt, localize(*coarse.asked, coarse.context.check), replace(doubt, inliers=0))
 
     def nothing(*_: Any) -> None:
         """Neither a coarse answer nor what a photograph without a pose could give."""
 
-    return Method(prepare, cast(Any, list), cast(Any, refine), nothing, nothing)
+    return Method(prepare, cast(Any, list), solve, nothing, nothing)
 
 
 COARSE_X_M = 7.0
@@ -233,7 +238,8 @@ class Staged:
     def _coarse_answer(self, coarse: Any) -> Answer | None:
         if self.coarse is None:
             return None
-        answer = whole(self._stand_in).refine(coarse)
+        query, references, pipeline, options = coarse.asked
+        answer = self._stand_in(query, references, pipeline, options, coarse.context.check)
         found = Localization(self.coarse, None, PoseStage.COARSE, 0, 0, 0.0)
         return replace(answer, outcome=found, stage_seconds={"coarse": 0.1})
 

@@ -46,7 +46,7 @@ def test_comparison_names_what_differs_and_the_ratio_of_errors() -> None:
 
 
 def test_expected_answers_of_each_kind() -> None:
-    both = [{}, {}]
+    both: list[dict[str, object]] = [{}, {}]
     assert is_expected(row("a", "AMBIGUOUS", "rejected as ambiguous", hypotheses=both))
     assert not is_expected(row("a", "AMBIGUOUS", "rejected as ambiguous", hypotheses=[]))
     assert not is_expected(row("a", "LOW_OVERLAP", "right"))

@@ -1,47 +1,133 @@
 """Which references a query uses: those that it names, or those that resemble the photograph and match it most.
 
-A photograph that was not localized is also compared with them turned (so is one with a pose of little trust), and with
-references elsewhere than priors say.
+Also whether the photograph matches them more if it is turned, and whether references elsewhere contradict its pose.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 from scipy.special import bdtrc
 
 from mapless_server.errors import DataLoss
-from mapless_server.method.judge.answer import Answer
+from mapless_server.method.attempt import Where
+from mapless_server.method.judge.decide import CLEARLY_MORE
+from mapless_server.method.judge.hypothesis import Hypothesis
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
+from mapless_server.scenes import Choice, Narrowing, Selection
 from mapless_server.scenes.library import Loaded, load_usable
-from mapless_server.scenes.retrieval.ranking import spread_choice
+from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
 
 from . import tracking
-from .photos import QueryViews
-from .query import TURN, QueryRun, Tier
-from .tiers import CLEARLY_MORE
+from .material import Material
+from .photos import QueryViews, RasterForm
+from .query import TURN, Tier
+from .search import Search
+
+SHORTLIST = 2
+"""So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
+BENCHMARKS.md)."""
 
 TURN_REFERENCES = 10
-"""A photograph that was not localized is compared with so many references each way round, the most similar first."""
+"""A photograph is compared with so many references each way round, the most similar first."""
 
 MIRRORED_BY_CHANCE = 1e-6
 """A photograph is mirrored only if matches that are as likely with it as with its mirror image would be shared so
 unevenly with less than this probability."""
 
 
-def with_named(run: QueryRun, tier: Tier) -> QueryRun:
-    """Loads the references that the query names, and finds the photograph's features."""
+def described_anew(search: Search, tier: Tier) -> Material | None:
+    """The photograph and the references of the search's attempt; None if these are those of an attempt before."""
+    attempt, verdict, query = search.attempt, search.verdict, search.query
+    if attempt.where is Where.ONE_PLACE and verdict is not None and verdict.place is not None:
+        return search.materials[search.found.index(verdict.chosen)].of_place(verdict.place, attempt.basis)
+    if attempt.where is Where.ANYWHERE and verdict is not None and _is_same_anywhere(search):
+        return None
+    views = search.views.in_form(RasterForm(quarter_turns=round(attempt.angle_deg / 90)))
+    found = _chosen(search, views, tier) if query.chooses else _named(search, views, tier)
+    if tier.pipeline.matcher.pair_matching is None or found.query_matches is not None:
+        return found
+    with search.context.stage("correspond"):
+        matches = tier.pipeline.matcher.match_quickly(found.view, found.references, search.context.check)
+    return replace(found, query_matches=tuple(matches))
+
+
+def _narrowing_of(search: Search) -> Narrowing:
+    """Where the attempt's references are."""
+    narrowing = search.query.narrowing
+    return narrowing.limits if search.attempt.where is Where.ANYWHERE else narrowing
+
+
+def load_chosen(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loaded:
+    """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
+    if search.query.reference_ids:
+        return _load(search, reference_ids, tier)
+    report = partial(search.source.report_damaged, search.query.scene_key)
+    return load_usable(lambda some: _load(search, some, tier), reference_ids, (DataLoss,), report)
+
+
+def turned_to_match(search: Search, tier: Tier) -> RasterForm | Rejection:
+    """The raster in which clearly more of the photograph matches references than as it is; as it is if there is none.
+
+    The best of its references counts: others may not show the same.
+
+    Returns:
+        The raster; or the photograph's rejection, where its mirror image matches clearly more than any of these, and
+        not by chance. So it does if the photograph is mirrored, or shows another side of something symmetric: parts of
+        the place that look like the mirror image of others would give it a wrong pose.
+    """
+    forms = [*(RasterForm(quarter_turns=turns) for turns in range(4)), RasterForm(is_mirrored=True)]
+    *turned, mirrored = [_most_matches(search, search.views.in_form(form), tier) for form in forms]
+    best = max(turned, key=lambda it: it[0])
+    most, name = mirrored
+    chance = bdtrc(most - 1, most + best[0], 0.5) if most else 1.0
+    if most >= CLEARLY_MORE * best[0] and chance < MIRRORED_BY_CHANCE:
+        return _mirrored(most, best[0], name)
+    return forms[turned.index(best) if best[0] >= CLEARLY_MORE * turned[0][0] else 0]
+
+
+def resembles_elsewhere(search: Search, found: Hypothesis, tier: Tier) -> bool:
+    """Whether soft priors may have led to the wrong references, though the photograph was localized.
+
+    The reference that resembles it most is then not where they say, and references elsewhere contradict the pose.
+    """
+    material = search.material
+    assert material is not None
+    assert material.choice is not None
+    others = _outside(search, material.choice)
+    if not others or others[0][1] > 0:
+        return False
+    with search.context.stage("correspond"):
+        rivals = load_chosen(search, [name for name, _ in others[: tracking.OTHERS]], tier)[1]
+        return tracking.is_contradicted(found, material.view, rivals, tier.pipeline.matcher)
+
+
+def _is_same_anywhere(search: Search) -> bool:
+    """Whether the references that were chosen where soft priors say are those that would be chosen anywhere."""
+    material = search.material
+    return material is not None and material.choice is not None and not _outside(search, material.choice)
+
+
+def _outside(search: Search, choice: Choice) -> list[tuple[str, int]]:
+    """Ids of references that resemble the photograph and were not chosen, with their rank among all."""
+    inside = {it.reference_id for it in choice.references}
+    with search.context.stage("retrieval"):
+        alike = _shortlisted(search, search.views, search.query.narrowing.limits).references
+    return [(it.reference_id, rank) for rank, it in enumerate(alike) if it.reference_id not in inside]
+
+
+def _named(search: Search, views: QueryViews, tier: Tier) -> Material:
     # References come first: a wrong name is found before the photograph is described.
-    generation, references = run.load(run.query.reference_ids, tier)
-    view = run.views.view(tier.extractor, run.context)
-    return run.but(generation=generation, references=references, view=view)
+    generation, references = _load(search, search.query.reference_ids, tier)
+    return Material(search.attempt.basis, views, views.view(tier.extractor, search.context), references, generation)
 
 
-def with_chosen(run: QueryRun, tier: Tier) -> QueryRun:
+def _chosen(search: Search, views: QueryViews, tier: Tier) -> Material:
     """Chooses, among the references that resemble the photograph most, those with the most matches."""
-    query, context = run.query, run.context
-    choice = run.choose(query.narrowing)
-    generation, shortlist = load_chosen(run, [it.reference_id for it in choice.references], tier)
-    view = run.views.view(tier.extractor, context)
+    query, context = search.query, search.context
+    choice = _shortlisted(search, views, _narrowing_of(search))
+    generation, shortlist = load_chosen(search, [it.reference_id for it in choice.references], tier)
+    view = views.view(tier.extractor, context)
 
     def choose(indices: Sequence[int], match_counts: Sequence[int]) -> list[int]:
         centres = [shortlist[i].world_from_camera.translation for i in indices]
@@ -51,38 +137,20 @@ def with_chosen(run: QueryRun, tier: Tier) -> QueryRun:
         matcher = tier.pipeline.matcher
         matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check)
     chosen, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
-    found = run.but(generation=generation, references=chosen, view=view, choice=choice)
-    return found.but(query_matches=query_matches)
+    return Material(search.attempt.basis, views, view, chosen, generation, choice, query_matches)
 
 
-def load_chosen(run: QueryRun, reference_ids: Sequence[str], tier: Tier) -> Loaded:
-    """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
-    if run.query.reference_ids:
-        return run.load(reference_ids, tier)
-    report = partial(run.source.report_damaged, run.query.scene_key)
-    return load_usable(lambda some: run.load(some, tier), reference_ids, (DataLoss,), report)
+def _shortlisted(search: Search, views: QueryViews, narrowing: Narrowing) -> Choice:
+    """Chooses the shortlist of references within limits and likely values of the pose."""
+    query = search.query
+    selection = Selection(SHORTLIST * query.reference_count, narrowing, query.reference_ids, THINNED_LATER)
+    return search.source.choose(query.scene_key, views, selection, search.context)
 
 
-def turned_to_match(run: QueryRun, tier: Tier) -> QueryViews | Rejection:
-    """The photograph turned such that clearly more of it matches references than as it is; else as it is.
-
-    The best of its references counts: others may not show the same.
-
-    Returns:
-        The photograph; or its rejection, where its mirror image matches clearly more than any of these, and not by
-        chance. So it does if the photograph is mirrored, or shows another side of something symmetric: parts of the
-        place that look like the mirror image of others would give it a wrong pose.
-    """
-    context = run.context
-    with context.stage(TURN):
-        found = [run.views, *(run.views.turned(turns, context) for turns in (1, 2, 3)), run.views.mirrored(context)]
-    *turned, mirrored = [_most_matches(run.but(views=views), tier) for views in found]
-    best = max(turned, key=lambda it: it[0])
-    most, name = mirrored
-    chance = bdtrc(most - 1, most + best[0], 0.5) if most else 1.0
-    if most >= CLEARLY_MORE * best[0] and chance < MIRRORED_BY_CHANCE:
-        return _mirrored(most, best[0], name)
-    return found[turned.index(best) if best[0] >= CLEARLY_MORE * turned[0][0] else 0]
+def _load(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loaded:
+    # Only before a first result the features of references are waited for.
+    waits = not search.found
+    return search.source.load(search.query.scene_key, reference_ids, tier.extractor, search.context, waits)
 
 
 def _mirrored(most: int, not_mirrored: int, reference: str) -> Rejection:
@@ -97,46 +165,18 @@ def _mirrored(most: int, not_mirrored: int, reference: str) -> Rejection:
     return Rejection(RejectionReason.GATE, message, Hint(TURN, Advice.CHECK_CALIBRATION, advice, reference))
 
 
-def _most_matches(run: QueryRun, tier: Tier) -> tuple[int, str]:
+def _most_matches(search: Search, views: QueryViews, tier: Tier) -> tuple[int, str]:
     """Most matches of the photograph with one of the references that it resembles, or of those named; its name."""
-    query = run.query
+    query = search.query
+    with search.context.stage(TURN):
+        view = views.view(tier.extractor, search.context)
     if query.chooses:
-        chosen = run.choose(query.narrowing).references[:TURN_REFERENCES]
-        references = load_chosen(run, [it.reference_id for it in chosen], tier)[1]
+        chosen = _shortlisted(search, views, _narrowing_of(search)).references[:TURN_REFERENCES]
+        references = load_chosen(search, [it.reference_id for it in chosen], tier)[1]
     else:
-        references = run.load(query.reference_ids[:TURN_REFERENCES], tier)[1]
-    view = run.views.view(tier.extractor, run.context)
-    with run.context.stage(TURN):
-        matches = tier.pipeline.matcher.match_quickly(view, references, run.context.check)
+        references = _load(search, query.reference_ids[:TURN_REFERENCES], tier)[1]
+    with search.context.stage(TURN):
+        matches = tier.pipeline.matcher.match_quickly(view, references, search.context.check)
     counts = list(map(len, matches))
     best = max(range(len(counts)), key=counts.__getitem__, default=None)
     return (0, "") if best is None else (counts[best], references[best].name)
-
-
-def may_be_elsewhere(run: QueryRun, tier: Tier, answer: Answer) -> bool:
-    """Whether soft priors may have led to the wrong references.
-
-    That is if the photograph was not localized, and references elsewhere would be chosen without them; or if the
-    reference that resembles it most is not where they say, and references elsewhere contradict the pose.
-    """
-    outcome, query = answer.outcome, run.query
-    is_excluded = isinstance(outcome, Rejection) and bool(outcome.intrinsics_checks)
-    if run.choice is None or query.is_part or is_excluded or not query.narrowing.has_likely:
-        return False
-    with run.context.stage("retrieval"):
-        alike = run.choose(query.narrowing.limits).references
-    inside = {it.reference_id for it in run.choice.references}
-    if isinstance(outcome, Rejection):
-        return any(it.reference_id not in inside for it in alike)
-    if not alike or alike[0].reference_id in inside:
-        return False
-    assert run.view is not None
-    others = [it.reference_id for it in alike if it.reference_id not in inside][: tracking.OTHERS]
-    with run.context.stage("correspond"):
-        rivals = load_chosen(run, others, tier)[1]
-        return tracking.is_contradicted(answer, run.view, rivals, tier.pipeline.matcher)
-
-
-def is_searched(run: QueryRun) -> bool:
-    """Whether the scene has references to choose from."""
-    return run.choice is not None and bool(run.choice.descriptor)

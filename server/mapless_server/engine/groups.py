@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from mapless_server.errors import Overloaded, RequestError
@@ -15,11 +15,29 @@ from mapless_server.scheduling import StageRecord
 from .query import Caller, Query, Result
 
 if TYPE_CHECKING:  # services need not load what computes
+    from mapless_server.method.rejection import Rejection
+
     from .queue_engine import QueueEngine
 
 MAX_RIG_IMAGES = 8
 MIN_FRAMES, MAX_FRAMES = 2, 16
 """Of a sequence."""
+
+
+def after_rejection(queries: Sequence[Query], outcome: Rejection) -> list[Query] | None:
+    """The photographs of a group on the rung that follows their joint rejection; None if no rung changes references.
+
+    Each photograph has climbed the other rungs by itself.
+    """
+    from mapless_server.method.attempt import Attempt, Where  # services need not load what computes
+    from mapless_server.method.judge.hypothesis import doubt_of
+    from mapless_server.method.ladder import Situation, further
+
+    situation = Situation(may_be_elsewhere=any(it.chooses and it.narrowing.has_likely for it in queries))
+    following = further(Attempt(), None, [Attempt()], doubt_of(outcome), situation)
+    if not any(attempt.where is Where.ANYWHERE for _, attempt in following):
+        return None
+    return [replace(it, narrowing=it.narrowing.limits) for it in queries]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,28 +1,11 @@
-"""Options of the engine, and of trying stronger features."""
+"""Options of the engine."""
 
 from dataclasses import dataclass, field
 
 from mapless_server.bounds import check_bounds
 from mapless_server.images import ImageLimits
+from mapless_server.method.options import DoubtOptions
 from mapless_server.scheduling import WorkQueueOptions
-
-
-@dataclass(frozen=True)
-class EscalationOptions:
-    """Options of trying stronger features.
-
-    Attributes:
-        doubtful_trust: a pose with less trust is doubtful. Of 2,528 photographs, many with few references, SIFT
-            and EdgePoint2 had 115 off by over 5 % of the distance, 5 degrees or 25 cm; trying again below this trust
-            tries 393, 114 of these among them; below 0.2 it tries 335, 109 of these among them.
-        doubtful_radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.
-    """
-
-    doubtful_trust: float = 0.25
-    doubtful_radius_m: float = 0.2
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "doubtful_trust doubtful_radius_m", at_least=0)
 
 
 @dataclass(frozen=True)
@@ -34,7 +17,7 @@ class EngineOptions:
         max_batch: largest number of queries that a network reconstructs together.
         image_limits: limits of the images that are decoded.
         index_cache_bytes: memory for the scenes' indexes, by which references are chosen.
-        escalation: when stronger features are tried.
+        doubt: when an accepted pose is doubtful, so that further attempts are made.
         coverage: share of right answers to accept where a request does not say.
         queue: options of the work queue.
     """
@@ -43,7 +26,7 @@ class EngineOptions:
     max_batch: int = 4
     image_limits: ImageLimits = field(default_factory=ImageLimits)
     index_cache_bytes: int = 1024 * 2**20
-    escalation: EscalationOptions = field(default_factory=EscalationOptions)
+    doubt: DoubtOptions = field(default_factory=DoubtOptions)
     coverage: float = 0.95
     queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)
 

@@ -65,76 +65,32 @@ class Description:
     ignored_share: float = 0.0
 
 
-class QueryViews:
-    """Decodes a photograph once, and describes it once with each extractor, when first needed.
+@dataclass(frozen=True)
+class RasterForm:
+    """The raster in which features of a photograph are found.
 
     Attributes:
-        quarter_turns: clockwise, of the raster in which its features are found.
-        is_mirrored: whether they are found in the raster exchanged left and right, and their pixels are of that: such a
-            view can be matched, but has no pose.
+        quarter_turns: clockwise, of the raster; pixels of the features are of the photograph as it is.
+        max_pixels: about so many at most; None for all.
+        is_mirrored: whether it is exchanged left and right, and pixels of the features are of that: such a view can be
+            matched, but has no pose.
     """
 
+    quarter_turns: int = 0
+    max_pixels: int | None = None
+    is_mirrored: bool = False
+
+
+class _Decoded:
+    """A photograph that is decoded when it is first needed, and its views so far, by extractor and form."""
+
     def __init__(self, photo: Photo, limits: ImageLimits) -> None:
-        self._photo = photo
-        self._limits = limits
+        self.views: dict[tuple[str, RasterForm], View] = {}
+        self._photo, self._limits = photo, limits
         self._photograph: Photograph | None = None
-        self._views: dict[str, View] = {}
-        self._max_pixels: int | None = None
-        self.quarter_turns, self.is_mirrored = 0, False
-        self._not_turned: QueryViews | None = None
 
-    def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
-        """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
-        if extractor.name not in self._views:
-            photograph = self._decoded(context)
-            with context.stage("features"):
-                pixels, camera = photograph.read(), photograph.camera
-                if self._max_pixels is not None:
-                    share = min(1.0, math.sqrt(self._max_pixels / (camera.width_px * camera.height_px)))
-                    pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
-                ignored = photograph.read_ignored()
-                if self.quarter_turns:
-                    view = extract_turned(extractor, pixels, camera, self.quarter_turns, ignored)
-                elif self.is_mirrored:
-                    mirrored = None if ignored is None else ignored[:, ::-1]
-                    view = extractor.extract(np.ascontiguousarray(pixels[:, ::-1]), camera, mirrored)
-                else:
-                    view = extractor.extract(pixels, camera, ignored)
-            self._views[extractor.name] = replace(view, photograph=photograph)
-        return self._views[extractor.name]
-
-    def reduced(self, max_pixels: int, context: StageContext) -> QueryViews:
-        """The same photograph, decoded once, whose features are found in a reduced image with about so many pixels."""
-        views = QueryViews(self._photo, self._limits)
-        views._photograph, views._max_pixels = self._decoded(context), max_pixels
-        return views
-
-    def turned(self, quarter_turns: int, context: StageContext) -> QueryViews:
-        """The same photograph, decoded once, whose features are found in its raster turned clockwise.
-
-        Their pixels are of the photograph as it is, and so is its pose.
-        """
-        views = QueryViews(self._photo, self._limits)
-        views._photograph, views.quarter_turns = self._decoded(context), quarter_turns
-        views._not_turned = self.not_turned
-        return views
-
-    def mirrored(self, context: StageContext) -> QueryViews:
-        """The same photograph, decoded once, whose features are found in its raster exchanged left and right."""
-        views = QueryViews(self._photo, self._limits)
-        views._photograph, views.is_mirrored = self._decoded(context), True
-        return views
-
-    def ignored_share(self, context: StageContext) -> float:
-        """Share of the pixels that its mask ignores, 0 to 1; InvalidArgument if image or mask is bad."""
-        return self._decoded(context).ignored_share
-
-    @property
-    def not_turned(self) -> QueryViews:
-        """The same photograph, whose features are found in its raster as it is."""
-        return self._not_turned or self
-
-    def _decoded(self, context: StageContext) -> Photograph:
+    def read(self, context: StageContext) -> Photograph:
+        """The photograph; InvalidArgument if it is bad."""
         if self._photograph is None:
             photo = self._photo
             with context.stage("decode"):
@@ -143,3 +99,47 @@ class QueryViews:
             identify = lambda: hashlib.sha256(photo.image).hexdigest()  # noqa: E731
             self._photograph = Photograph(identify, photo.camera, lambda: pixels, lambda: ignored)
         return self._photograph
+
+
+class QueryViews:
+    """Decodes a photograph once, and describes it once with each extractor in each form, when first needed.
+
+    Attributes:
+        form: the raster in which its features are found.
+    """
+
+    def __init__(self, photo: Photo, limits: ImageLimits) -> None:
+        self.form = RasterForm()
+        self._decoded = _Decoded(photo, limits)
+
+    def in_form(self, form: RasterForm) -> QueryViews:
+        """The same photograph, decoded once, whose features are found in another raster."""
+        views = object.__new__(QueryViews)
+        views.form, views._decoded = form, self._decoded
+        return views
+
+    def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
+        """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
+        known, key = self._decoded.views, (extractor.name, self.form)
+        if key not in known:
+            photograph = self._decoded.read(context)
+            with context.stage("features"):
+                known[key] = replace(_extracted(extractor, photograph, self.form), photograph=photograph)
+        return known[key]
+
+    def ignored_share(self, context: StageContext) -> float:
+        """Share of the pixels that its mask ignores, 0 to 1; InvalidArgument if image or mask is bad."""
+        return self._decoded.read(context).ignored_share
+
+
+def _extracted(extractor: FeatureExtractor, photograph: Photograph, form: RasterForm) -> View:
+    pixels, camera, ignored = photograph.read(), photograph.camera, photograph.read_ignored()
+    if form.max_pixels is not None:
+        share = min(1.0, math.sqrt(form.max_pixels / (camera.width_px * camera.height_px)))
+        pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
+    if form.is_mirrored:
+        mirrored = None if ignored is None else ignored[:, ::-1]
+        return extractor.extract(np.ascontiguousarray(pixels[:, ::-1]), camera, mirrored)
+    if form.quarter_turns:
+        return extract_turned(extractor, pixels, camera, form.quarter_turns, ignored)
+    return extractor.extract(pixels, camera, ignored)

@@ -1,36 +1,32 @@
-"""Inputs and results of the engine, and the state of a query between its stages."""
+"""Inputs and results of the engine."""
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from mapless_server import __version__
 from mapless_server.method.bundle.priors import NO_PRIORS, Priors
 from mapless_server.method.options import StageContext, Variant
-from mapless_server.scenes import Selection
-from mapless_server.scenes.retrieval.ranking import THINNED_LATER
-from mapless_server.scheduling import Job, StageResult, Step
 from mapless_server.store import SceneAttributes, calibration_kind
-
-from .photos import Photo, QueryViews
 
 if TYPE_CHECKING:  # services need not load what computes
     from mapless.geometry import Camera
     from mapless_server.method.features.extractors import FeatureExtractor
-    from mapless_server.method.features.views import Matches, PosedView, View
+    from mapless_server.method.features.views import PosedView
     from mapless_server.method.judge.answer import Answer
     from mapless_server.method.options import LocalizeOptions
     from mapless_server.method.pipeline import Pipeline
-    from mapless_server.scenes import Choice, Narrowing
+    from mapless_server.scenes import Choice, Narrowing, Selection
     from mapless_server.scenes.library import Loaded
     from mapless_server.scheduling import Flow
     from mapless_server.security import SceneKey
+
+    from .photos import Photo, QueryViews
 
 PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
 """The stages of a query."""
@@ -44,21 +40,11 @@ TRACK = "track"
 TURN = "turn"
 """The stage of comparing a photograph that was not localized, or with little trust, with its references turned, too."""
 
-UNFINISHED = "/unfinished"
-"""Ends the name of a stage: its tier came to no answer, see `Result`."""
-
 MAX_TRACKED_SIGMA_DEG = 20.0
 """Priors of a less certain rotation do not say what the photograph shows."""
 
 DEFAULT_REFERENCE_COUNT = 10
 """References that are chosen where the request does not say how many."""
-
-SHORTLIST = 2
-"""So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
-BENCHMARKS.md)."""
-
-_COUNTS = (2, 5, 10, 20, 64)
-"""Queries with about as many references cost about as much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +172,8 @@ class Result:
         processed: the camera of the reduced image that features were found in.
         choice: how the references were chosen; None if the caller named them.
         attributes: attributes of the scene.
-        stage_seconds: time of every stage that was computed, in order, of all searches. The name of a stage of a
-            further search begins with its extractor's name and a slash. Such a search has only "unfinished" if it
-            failed, was ended for lack of time, or its tier has not described the references yet.
+        stage_seconds: time of every stage that was computed, in order, of all attempts. The name of a stage of other
+            features, references or rasters than the first ones begins with the extractor's name and a slash.
         attempts: the attempts that were made, in order.
     """
 
@@ -201,13 +186,6 @@ class Result:
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
     stage_seconds: dict[str, float] = field(default_factory=dict)
     attempts: tuple[Tried, ...] = ()
-
-    def seconds_with(self, stage_seconds: Mapping[str, float]) -> dict[str, float]:
-        """Time of its stages and of those of a further search with a tier; a tier may search several times."""
-        seconds = dict(self.stage_seconds)
-        for name, spent_s in stage_seconds.items():
-            seconds[name] = seconds.get(name, 0.0) + spent_s
-        return seconds
 
     @property
     def is_tracked(self) -> bool:
@@ -240,109 +218,3 @@ class ReferenceSource(Protocol):
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Reports that a chosen reference is not used because it is damaged."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class QueryRun:
-    """The state of a query between its stages, in one tier.
-
-    Attributes:
-        query: the query.
-        source: source of the references.
-        views: the photograph.
-        deadline_s: time after which the answer is useless, by `time.monotonic`.
-        on_better: called in the computing thread with each result that may be shown before the answer.
-        tier: index of the tier that computes.
-        best: best result so far; None in the first search of the first tier.
-        start_s: when this tier began, by `time.monotonic`.
-        give_up_s: time after which `best` is the answer, if this tier has none by then.
-        narrowed: the query with the soft priors' choice of references, if references elsewhere are now searched.
-        tries_turns: whether the photograph is to be turned as it matches most: as it is, there is no or little trust.
-        ambiguous: the rejection as ambiguous, if the references of the place that the priors decided for are now used.
-        listings: how often the scene was listed in this tier.
-        context: cancels and times this tier's stages; from here on set by the stage `prepare`.
-        references: the references that are used, in order.
-        generation: generation of the scene when they were read.
-        attributes: attributes of the scene.
-        view: the photograph with this tier's features; None until the tier's first step has found them.
-        choice: how the references were chosen; None if the caller named them.
-        query_matches: matches of the photograph with each reference, if references were chosen by these or are matched
-            one by one.
-        unmatched: indices of the references that the photograph is still to be matched with again (`Matcher.rematch`),
-            each in a step of its own, so that a busy server computes for other callers in between.
-        part: the method's intermediate result between two stages.
-    """
-
-    query: Query
-    source: ReferenceSource
-    views: QueryViews
-    deadline_s: float
-    on_better: Callable[[Result], object] | None = None
-    tier: int = 0
-    best: Result | None = None
-    start_s: float = field(default_factory=time.monotonic)
-    give_up_s: float = math.inf
-    narrowed: Query | None = None
-    tries_turns: bool = False
-    ambiguous: Result | None = None
-    listings: int = 1
-    context: StageContext = field(default_factory=StageContext)
-    references: tuple[PosedView, ...] = ()
-    generation: int = 0
-    attributes: SceneAttributes = field(default_factory=SceneAttributes)
-    view: View | None = None
-    choice: Choice | None = None
-    query_matches: tuple[Matches, ...] | None = None
-    unmatched: tuple[int, ...] = ()
-    part: Any = None
-
-    def but(self, **changes: Any) -> QueryRun:
-        """A copy with these values; `dataclasses.replace` takes ten times as long, which six copies a query show."""
-        assert vars(self).keys() >= changes.keys()
-        copy = object.__new__(QueryRun)
-        vars(copy).update(vars(self), **changes)
-        return copy
-
-    @property
-    def kind(self) -> str:
-        """Kind of the query's jobs; jobs of one kind take about the same time."""
-        if self.tracks:
-            return "tracked"
-        ids = self.query.reference_ids
-        count = next((count for count in _COUNTS if len(ids) <= count), _COUNTS[-1])
-        turned = ", turned" if self.tries_turns else ""
-        return f"tier {self.tier}{turned}, {'chosen' if self.query.chooses else f'up to {count}'}"
-
-    @property
-    def tracks(self) -> bool:
-        """Whether this tier begins with the references near the prior."""
-        return self.best is None and self.query.can_be_tracked
-
-    @property
-    def earlier(self) -> Result | None:
-        """The result if this computation comes to none."""
-        return self.best or self.ambiguous
-
-    @property
-    def first_step(self) -> Step[QueryRun]:
-        """The first step of the query in its tier."""
-        kind = self.kind
-        return Step(PREPARE, kind, kind, self)
-
-    def choose(self, narrowing: Narrowing) -> Choice:
-        """Chooses the shortlist of references within limits and likely values of the pose."""
-        query = self.query
-        selection = Selection(SHORTLIST * query.reference_count, narrowing, query.reference_ids, THINNED_LATER)
-        return self.source.choose(query.scene_key, self.views, selection, self.context)
-
-    def load(self, reference_ids: Sequence[str], tier: Tier) -> Loaded:
-        """Loads references with the tier's features."""
-        # Only the first tier waits for its references' features: before a stronger one there is an answer.
-        waits = self.best is None
-        return self.source.load(self.query.scene_key, reference_ids, tier.extractor, self.context, waits)
-
-
-QueryStep = Step[QueryRun]
-QueryJob = Job[QueryRun, Result]
-QueryStageResult = StageResult[QueryRun, Result]
-"""The queue's types with a query's payload and value."""

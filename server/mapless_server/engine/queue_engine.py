@@ -33,8 +33,9 @@ from mapless_server.security import SceneKey
 from .failures import failure_of
 from .options import EngineOptions
 from .photos import Description, Photo, QueryViews
-from .query import COARSE, PREPARE, REFINE, Caller, Query, QueryJob, QueryRun, ReferenceSource, Result, Tier
+from .query import COARSE, PREPARE, REFINE, Caller, Query, ReferenceSource, Result, Tier
 from .references import References
+from .search import Search, SearchJob
 from .stages import Method, QueryStages
 
 ItemT = TypeVar("ItemT")
@@ -88,7 +89,7 @@ class QueueEngine:
         self.options = options
         self.references = references
         self.background: BackgroundMatching | None = None
-        stages = QueryStages(self.tiers, options.escalation, method, is_alone=self._is_alone)
+        stages = QueryStages(self.tiers, options.doubt, method, is_alone=self._is_alone)
         is_batched = any(tier.pipeline.reconstructor.is_batched for tier in tiers)
         coarse = Stage(COARSE, DEVICE, REFINE, options.max_batch) if is_batched else Stage(COARSE, HOST, REFINE)
         self.queue = WorkQueue(
@@ -116,23 +117,22 @@ class QueueEngine:
         source: ReferenceSource | None = None,
         *,
         on_better: Callable[[Result], None] | None = None,
-    ) -> QueryJob:
+    ) -> SearchJob:
         """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
         `source` replaces the references, for the warm-up. `on_better` is called on the event loop, before the answer,
-        with each localization that is better than those before, while further attempts follow; first with the coarse
-        pose, which nothing has checked, where the query allows it. It is called again if references are deleted while
-        they are used. The answer does not depend on it.
+        with each accepted answer that is better than the ones before while another attempt follows; and, if the query
+        allows it, with the coarse pose, which nothing has checked. The answer does not depend on it.
         """
         views = QueryViews(query.photo, self.options.image_limits)
-        run = QueryRun(query, source or self.references, views, caller.deadline_s)
+        search = Search.begin(query, source or self.references, views, caller.deadline_s)
         if on_better is not None:
             loop = asyncio.get_running_loop()
-            run = replace(run, on_better=lambda result: loop.call_soon_threadsafe(on_better, result))
+            search = replace(search, on_better=lambda result: loop.call_soon_threadsafe(on_better, result))
         size_bytes = 0 if query.is_part else query.photo.size_bytes  # which `hold` counts
-        return Job(caller.flow, run.first_step, caller.deadline_s, size_bytes)
+        return Job(caller.flow, search.first_step, caller.deadline_s, size_bytes)
 
-    async def run(self, job: QueryJob) -> Result:
+    async def run(self, job: SearchJob) -> Result:
         """Computes a query's job and returns its result."""
         with _as_request_errors():
             return await self.queue.run(job)

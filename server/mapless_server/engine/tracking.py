@@ -3,14 +3,13 @@
 A robot or a headset sends its previous answer, moved by its odometry, as the pose prior of each photograph. Then
 nothing has to be found: the references near the prior are used, the same ones all around a place, so that what depends
 on them alone is in the caches; the photograph is reduced; and the points are triangulated, whichever backend the server
-has. If that does not suffice, the full search follows, as for any photograph.
+has. If that leaves any doubt, the search follows as for any photograph, without what tracking has found.
 
 Beyond its part in every answer the prior chooses the references, and nothing else. Matches are searched in the whole
 photograph, which takes less time than to gather those near each point's projection, and leaves the evidence as it is:
 matches that a wrong prior has selected agree with it. Gate, judge and checks are those of every answer. In one way a
 prior could make a wrong answer likelier: the references near it may show a copy of what the photograph shows. So
-references elsewhere that resemble the photograph, wherever the prior is, must not contradict the pose. If they do, the
-search decides, as it does of every photograph with this prior.
+references elsewhere that resemble the photograph, wherever the prior is, must not contradict the pose.
 """
 
 import math
@@ -19,21 +18,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapless_server.method.bundle.priors import Priors
+from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.features.views import PosedView, View
-from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.evidence import EPIPOLAR_PX
-from mapless_server.method.localize import prepare, solve
-from mapless_server.method.options import LocalizeOptions, StageContext
+from mapless_server.method.judge.hypothesis import Doubt, Found, Hypothesis
+from mapless_server.method.options import DoubtOptions
 from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.epipolar import epipolar_distance_px
-from mapless_server.method.pipeline import Pipeline, reconstruct
 from mapless_server.scenes import Choice, RankedReference
 
-from .options import EscalationOptions
 from .query import Tier
-from .tiers import is_doubtful
 
 MAX_PIXELS = 384 * 288
 """Of the reduced photograph: features take a third of the time of 640x480, matching and adjusting them half. Medians of
@@ -60,37 +55,19 @@ def tracking_tier(tier: Tier) -> Tier:
     return replace(tier, pipeline=replace(tier.pipeline, reconstructor=_GEOMETRIC))
 
 
-def track(
-    view: View,
-    references: Sequence[PosedView],
-    pipeline: Pipeline,
-    options: LocalizeOptions,
-    context: StageContext,
-    priors: Priors,
-) -> Answer:
-    """The answer from references near the prior, without wide correspondences and matches of single references."""
-    with context.stage("correspond"):
-        matches = pipeline.matcher.match_quickly(view, references, context.check)
-    prepared = prepare(view, references, pipeline, options, context, matches, priors)
-    if isinstance(prepared, Answer):
-        return prepared
-    (coarse,) = reconstruct([prepared])
-    if isinstance(coarse, Exception):
-        raise coarse
-    return coarse if isinstance(coarse, Answer) else solve(coarse)
+def doubts_of_tracked(found: Hypothesis, options: DoubtOptions) -> Doubt:
+    """The doubts that a pose from references near the prior leaves beside those of any pose.
 
-
-def suffices(answer: Answer, weak_inliers: int, doubt: EscalationOptions) -> bool:
-    """Whether an answer is one that the full search would not be expected to improve.
-
-    That is a pose that agrees with the priors and is not doubtful, with enough inliers that no initial pose has led to.
+    It must agree with the priors, and have enough inliers that no initial pose has led to.
     """
-    outcome, support = answer.outcome, answer.support
-    if not isinstance(outcome, Localization) or support is None or support.estimate is None:
-        return False
-    found = support.estimate.inliers & ~support.matches.guided
-    is_consistent = not any(check.conflict for check in outcome.prior_checks)
-    return is_consistent and int(found.sum()) >= weak_inliers and not is_doubtful(answer, doubt)
+    support = found.answer.support
+    if not found.is_accepted or not isinstance(support, PosedSupport):
+        return found.doubts | Doubt.CHANCE
+    doubts = found.doubts
+    if any(check.conflict for check in support.estimate.prior_checks):
+        doubts |= Doubt.LIKE_ELSEWHERE
+    alone = support.estimate.inliers & ~support.matches.guided
+    return doubts | (Doubt.FEW_INLIERS if int(alone.sum()) < options.inliers else Doubt.NONE)
 
 
 def elsewhere(near: Choice, alike: Choice) -> list[RankedReference]:
@@ -101,10 +78,10 @@ def elsewhere(near: Choice, alike: Choice) -> list[RankedReference]:
     return far[:OTHERS]
 
 
-def is_contradicted(answer: Answer, view: View, others: Sequence[PosedView], matcher: Matcher) -> bool:
-    """Whether other references share much with the photograph that does not fit the pose of an answer."""
-    assert isinstance(answer.outcome, Localization)
-    posed = PosedView("", "", view, answer.outcome.world_from_camera)
-    many = RIVAL_SHARE * max(answer.reference_match_counts)
+def is_contradicted(found: Found, view: View, others: Sequence[PosedView], matcher: Matcher) -> bool:
+    """Whether other references share much with the photograph that does not fit the pose of a hypothesis."""
+    assert isinstance(found, Hypothesis)
+    posed = PosedView("", "", view, found.world_from_camera)
+    many = RIVAL_SHARE * max(found.answer.reference_match_counts)
     matches = zip(others, matcher.match_quickly(view, others), strict=True)
-    return any((epipolar_distance_px(posed, it, found) >= EPIPOLAR_PX).sum() >= many for it, found in matches)
+    return any((epipolar_distance_px(posed, it, pairs) >= EPIPOLAR_PX).sum() >= many for it, pairs in matches)

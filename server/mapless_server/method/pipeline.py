@@ -24,7 +24,7 @@ from .pairs.correspond import Correspondences, Matcher
 from .pairs.pair import Matching
 from .pose.one_reference import OneReferenceOptions
 from .pose.pnp import PnpOptions
-from .rejection import Rejection, RejectionReason
+from .rejection import Rejection
 from .structure.kept_depth import with_kept_depths
 from .structure.match import PAPER_MATCH, MatchOptions, match_points, vote
 from .structure.model import MetricScale, PointMatches, Structure
@@ -38,19 +38,12 @@ class StageOptions:
     """Options of the stages after the coarse one, the same for all queries; the defaults are the best measured.
 
     Attributes:
-        weak_inliers: an answer of `Variant.BEST` with fewer inliers is computed again from wide correspondences (see
-            `correspond`), and replaced if they give more inliers. They do not help above a hundred inliers.
-        max_radius_ratio: the wide answer is not used if its radius is more than this many times as large. Where it was
-            better, its radius was at most 1.7 times as large; where repeated floor tiles had given it inliers, and
-            centimetres of error, 40 to 80 times.
         pnp: options of the pose solver.
         adjust: options of the final adjustment.
         judge: options of the judge.
         one_reference: options of the pose from a single reference, with a network that predicts metres.
     """
 
-    weak_inliers: int = 100
-    max_radius_ratio: float = 3.0
     pnp: PnpOptions = field(default_factory=PnpOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
     judge: JudgeOptions = field(default_factory=JudgeOptions)
@@ -139,36 +132,6 @@ class Prepared:
         similarity = self.pipeline.matcher.options.guided_similarity
         return self.pipeline.options.match(self.options.variant, similarity)
 
-    def can_improve(self, answer: Answer) -> bool:
-        """Whether wide correspondences could give a better answer."""
-        if self.options.variant is not Variant.BEST or len(self.references) < 2:
-            return False
-        if isinstance(answer.outcome, Rejection):
-            found = (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS)
-            return answer.outcome.reason not in found and not answer.outcome.intrinsics_checks
-        return answer.outcome.inlier_count < self.pipeline.options.weak_inliers
-
-    def can_use_two_views(self, answer: Answer) -> bool:
-        """Whether a pose may be estimated from two-view matches after this answer.
-
-        It may not if a stage has found the cause of the rejection: a second place, wrong intrinsics, or references at
-        one place. Nor if 2D-3D matches gave a pose that was not accepted: the same matches without points are no
-        better evidence. Of four photographs accepted in this way in `office-lockers`, two had wrong poses.
-        """
-        outcome = answer.outcome
-        if self.options.variant is not Variant.BEST or len(self.references) < 2 or isinstance(outcome, Localization):
-            return False
-        found = (RejectionReason.DEGENERATE_REFERENCES, RejectionReason.AMBIGUOUS, RejectionReason.GATE)
-        return outcome.reason not in found
-
-    def checked(self, answer: Answer) -> Answer:
-        """Compares an answer that was computed without the priors with them."""
-        outcome = answer.outcome
-        if isinstance(outcome, Rejection) or outcome.covariance is None:
-            return answer
-        checks = self.priors.shifted(self.origin).check(outcome.world_from_camera, outcome.covariance)
-        return replace(answer, outcome=replace(outcome, prior_checks=tuple(replace(it, used=False) for it in checks)))
-
 
 @dataclass(frozen=True, eq=False)
 class Coarse:
@@ -177,25 +140,12 @@ class Coarse:
     Attributes:
         prepared: the query.
         reconstruction: up to scale, or a rejection.
-        scale: the metric scale with the initial pose, in the world of `prepared`; or a rejection, if wide
-            correspondences are still to be tried.
+        scale: the metric scale with the initial pose, in the world of `prepared`; or a rejection.
     """
 
     prepared: Prepared
     reconstruction: Outcome
     scale: MetricScale | Rejection
-
-    @property
-    def rests_on_priors(self) -> bool:
-        """Whether the photograph alone gives no initial pose."""
-        return isinstance(self.reconstruction, Triangulation) and self.reconstruction.without_priors is not None
-
-    def without_priors(self) -> "Coarse":
-        """What the coarse stage gives without priors."""
-        free = replace(self, prepared=replace(self.prepared, priors=NO_PRIORS))
-        if isinstance(self.reconstruction, Triangulation) and (alone := self.reconstruction.without_priors):
-            return replace(free, reconstruction=alone, scale=alone)
-        return free
 
     def answer(self, outcome: Localization | Rejection, support: Support | None = None) -> Answer:
         """Makes the answer in the caller's world from an outcome in the world of `prepared`."""
@@ -208,15 +158,14 @@ class Coarse:
         return shifted(made, prepared.origin)
 
 
-def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
+def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Exception]:
     """Computes the coarse stage of a batch of queries of one reconstructor, then the metric scale of each.
 
     Those of one bucket are reconstructed together.
 
-    Returns for each query, in order, its reconstruction and scale; or its answer, if nothing remains to be computed; or
-    its own exception, unchanged: raised by its check, or while it alone was computed, such as a torch.OutOfMemoryError
-    for a batch of one. ValueError for several reconstructors; any other exception is of the batch as a whole, and
-    splitting it shows which query caused it.
+    Returns for each query, in order, its reconstruction and scale, or its own exception, unchanged: raised by its
+    check, or while it alone was computed, such as a torch.OutOfMemoryError for a batch of one. ValueError for several
+    reconstructors; any other exception is of the batch as a whole, and splitting it shows which query caused it.
     """
     if len({id(prepared.pipeline.reconstructor) for prepared in batch}) > 1:
         raise ValueError("batch must have queries of one reconstructor only")
@@ -229,14 +178,14 @@ def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Answer | Exception]:
     spent_s = time.perf_counter() - start_s
     for prepared in batch:
         prepared.context.add("coarse", spent_s)
-    return _each(lambda prepared, outcome: _answered_if_final(_scaled(prepared, outcome)), batch, outcomes)
+    return _each(_scaled, batch, outcomes)
 
 
 def coarse_answer(coarse: Coarse) -> Answer | None:
     """The answer if there is no time to refine: the pose of `Variant.COARSE`; None if there is no pose yet."""
     if isinstance(coarse.scale, Rejection):
         return None
-    return coarse.answer(_unverified(coarse.scale, PoseStage.COARSE))
+    return coarse.answer(unverified(coarse.scale, PoseStage.COARSE))
 
 
 def with_wide_correspondences(coarse: Coarse) -> Coarse:
@@ -286,17 +235,7 @@ def _scaled(prepared: Prepared, reconstruction: Outcome) -> Coarse:
         return Coarse(prepared, reconstruction, scale)
 
 
-def _answered_if_final(coarse: Coarse) -> Coarse | Answer:
-    """Returns the answer if nothing remains to be refined; else the coarse result unchanged."""
-    if isinstance(coarse.scale, Rejection):
-        answer = coarse.answer(coarse.scale)
-        return coarse if coarse.prepared.can_improve(answer) else answer
-    if coarse.prepared.options.variant is Variant.COARSE:
-        return coarse.answer(_unverified(coarse.scale, PoseStage.INITIAL))
-    return coarse
-
-
-def _unverified(scale: MetricScale, stage: PoseStage) -> Localization:
+def unverified(scale: MetricScale, stage: PoseStage = PoseStage.INITIAL) -> Localization:
     """The localization with the initial pose, which nothing has checked."""
     return Localization(scale.world_from_query, None, stage, 0, 0, 0.0, scale_source=scale.source)
 
@@ -337,6 +276,6 @@ def tracked_support(prepared: Prepared) -> Support | None:
     matches = vote(structure, [len(r.view.features) for r in references], correspondences)
     query_matches = tuple(correspondences.query_matches)
     sigma = prepared.options.intrinsics
-    support = Support(query, references, structure, matches, None, prepared.origin, None, query_matches, sigma)
-    support = replace(support, reference_error_px=correspondences.reference_error_px)
+    error_px = correspondences.reference_error_px
+    support = Support(query, references, structure, matches, prepared.origin, query_matches, sigma, error_px)
     return support if len(matches) else None

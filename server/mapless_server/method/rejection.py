@@ -103,7 +103,7 @@ class Hint:
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis:
+class PoseHypothesis:
     """One of several poses that explain the photograph.
 
     Attributes:
@@ -133,6 +133,6 @@ class Rejection:
     reason: RejectionReason
     message: str
     hint: Hint | None = None
-    hypotheses: tuple[Hypothesis, ...] = ()
+    hypotheses: tuple[PoseHypothesis, ...] = ()
     tried: int | None = None
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()

@@ -63,16 +63,17 @@ class Further:
     def choose(self, job: AnyJob, steps: Sequence[AnyStep], now_s: float) -> Choice:
         """Chooses the first step that ends before the job is due and fits within the bounds.
 
-        If none does, the last waits for an idle thread; or, if no thread will be idle because other callers ask for
+        If none does, the cheapest waits for an idle thread; or, if no thread will be idle because other callers ask for
         more than their share, for its turn; or none is computed.
         """
-        for step in steps:
-            cost_s = self._costs.of(step, job.flow, now_s)
+        costs = [(step, self._costs.of(step, job.flow, now_s)) for step in steps]
+        for step, cost_s in costs:
             if self._is_worthwhile(job, step, cost_s, now_s):
                 return Choice(step, When.IN_ORDER, cost_s)
+        step, cost_s = min(costs, key=lambda it: it[1].total())
         if self._may_wait(job, cost_s, now_s):
             return Choice(step, When.WHEN_IDLE, cost_s)
-        # Those before the last are never tried anyway: that could cost what the last gives.
+        # Those that cost more are never tried anyway: that could cost what the cheapest gives.
         is_computed = self._has_turn(job, cost_s, now_s) or self._is_tried_anyway(step)
         return Choice(step, When.IN_ORDER if is_computed else When.NEVER, cost_s)
 

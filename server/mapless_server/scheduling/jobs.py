@@ -154,9 +154,9 @@ class Next(Generic[PayloadT, ValueT]):
     """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring.
 
     With a fallback, the first of the steps that is predicted to end in time, and to cost no more than there is room for
-    beside the other jobs, is computed. If none is, the last waits until a thread would be idle otherwise, and the
-    fallback is given at once if that would be too late. So the steps are in order of preference, and the last is the
-    cheapest. Without a fallback the first is computed.
+    beside the other jobs, is computed. If none is, the cheapest waits until a thread would be idle otherwise, and the
+    fallback is given at once if that would be too late. So the steps are in order of preference. Without a fallback the
+    first is computed.
     """
 
     steps: tuple[Step[PayloadT], ...]

@@ -6,13 +6,19 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
-from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult, PhotoGroup
+from mapless_server.engine.groups import (
+    MAX_FRAMES,
+    MAX_RIG_IMAGES,
+    MIN_FRAMES,
+    GroupResult,
+    PhotoGroup,
+    after_rejection,
+)
 from mapless_server.engine.query import TRACK, Query, Result
 from mapless_server.errors import RequestError
 from mapless_server.method.judge.answer import Answer, Localization
@@ -280,14 +286,13 @@ async def localize_group(
 ) -> tuple[GroupResult, Joint]:
     """Localizes the photographs of a rig or a sequence, and computes their joint `pose`.
 
-    If it is rejected, the soft priors that chose the references may be wrong: with a pose from references of the whole
-    scene they are. That is tried while there is time; otherwise the rejection stays.
+    After a rejection the ladder says whether all of them are localized again; if that fails, the rejection stays.
     """
     group = await localize_photographs(engine, queries, call, list_name)
     outcome = await pose(queries, group.results)
-    if not isinstance(outcome, Rejection) or not any(it.chooses and it.narrowing.has_likely for it in queries):
+    elsewhere = after_rejection(queries, outcome) if isinstance(outcome, Rejection) else None
+    if elsewhere is None:
         return group, outcome
-    elsewhere = [replace(it, narrowing=it.narrowing.limits) for it in queries]
     try:
         again = await localize_photographs(engine, elsewhere, call, list_name)
         found = await pose(elsewhere, again.results)

@@ -22,6 +22,7 @@ from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
 from mapless_server.method.features.views import Features, Ignored, View
 from mapless_server.method.judge.answer import Answer
+from mapless_server.method.judge.hypothesis import Doubt, Failed
 from mapless_server.method.pipeline import Coarse, Pipeline, Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.logs import configure_logging
@@ -65,7 +66,7 @@ def no_op_method() -> Method:
     return Method(
         prepare=lambda *_: cast(Prepared, SimpleNamespace(bucket="nothing")),  # all queries are of one bucket
         reconstruct=lambda batch: [cast(Coarse, part) for part in batch],
-        refine=lambda *_: rejected,
+        solve=lambda _, attempt, __: Failed(attempt, rejected, Doubt.NONE),
         coarse_answer=lambda _: None,
     )
 

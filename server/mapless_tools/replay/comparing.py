@@ -16,7 +16,6 @@ from mapless import wire
 from mapless.geometry import rotation_angle_deg
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.engine.query import UNFINISHED
 from mapless_server.services.capture.calls import Response, diagnostics_of
 
 DESCRIBE = "describe"
@@ -96,7 +95,7 @@ def _essence(response: Any) -> Any:
             "captured",
         ):
             diagnostics.ClearField(name)
-        kept = [it.stage for it in diagnostics.stages if it.stage != DESCRIBE and not it.stage.endswith(UNFINISHED)]
+        kept = [it.stage for it in diagnostics.stages if it.stage != DESCRIBE]
         del diagnostics.stages[:]
         diagnostics.stages.extend(pb.StageTiming(stage=it) for it in kept)
     return copy

@@ -9,7 +9,7 @@ import asyncio
 import hashlib
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,23 +28,23 @@ from mapless_server.engine.query import (
     POSE_PRIOR,
     PREPARE,
     REFINE,
-    UNFINISHED,
     Caller,
     Query,
-    QueryJob,
-    QueryRun,
     Result,
     Tier,
 )
 from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.engine.search import Search, SearchJob
 from mapless_server.engine.stages import Method, QueryStages
 from mapless_server.errors import DataLoss
 from mapless_server.images import decode_image, decode_mask
+from mapless_server.method.attempt import Attempt
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
-from mapless_server.method.localize import refine
-from mapless_server.method.options import StageContext
-from mapless_server.method.pipeline import coarse_answer
+from mapless_server.method.judge.hypothesis import Found, found_by
+from mapless_server.method.options import DoubtOptions, StageContext
+from mapless_server.method.pipeline import Coarse, coarse_answer
+from mapless_server.method.solve import solve
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Selection
@@ -241,23 +241,22 @@ class _Recomputing:
         self._tiers = tiers
         self._parts = {part.field: part for part in call.parts}
         described = zip(self._parts, diagnostics_of(then), strict=True)
-        stages = {field: [it.stage for it in about.stages] for field, about in described}
-        self._stages = stages
-        self._described = {field for field, names in stages.items() if RETRIEVAL in names}
-        unrefined = Method(refine=lambda coarse: coarse_answer(coarse) or refine(coarse))
+        self._then = dict(described)
+        self._described = {field for field, it in self._then.items() if RETRIEVAL in [of.stage for of in it.stages]}
+        unrefined = Method(solve=_unrefined)
         self._method = unrefined if _is_cut_short(request, then) else Method()
 
-    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> QueryJob:
+    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> SearchJob:
         field = query.photo.field
         extractor, part = self._tiers[0].extractor, self._parts[field]
         recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._described)
         views = QueryViews(query.photo, self.options.image_limits)
-        return Job(Flow("", ""), QueryRun(query, recorded, views, math.inf).first_step, math.inf, 0)
+        return Job(Flow("", ""), Search.begin(query, recorded, views, math.inf).first_step, math.inf, 0)
 
-    async def run(self, job: QueryJob) -> Result:
-        run = job.step.payload
-        gives_up = given_up(self._stages[run.query.photo.field], self._tiers)
-        stages = QueryStages(self._tiers, self.options.escalation, self._method, gives_up)
+    async def run(self, job: SearchJob) -> Result:
+        search = job.step.payload
+        gives_up = given_up(self._then[search.query.photo.field], self._tiers)
+        stages = QueryStages(self._tiers, self.options.doubt, self._method, gives_up)
         return await asyncio.to_thread(_compute, stages, job)
 
     @contextmanager
@@ -268,7 +267,13 @@ class _Recomputing:
         return await asyncio.to_thread(compute)
 
 
-def _compute(stages: QueryStages, job: QueryJob) -> Result:
+def _unrefined(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
+    """The coarse pose, where the answer was given without time to refine it."""
+    answer = coarse_answer(coarse)
+    return solve(coarse, attempt, doubt) if answer is None else found_by(attempt, answer, doubt)
+
+
+def _compute(stages: QueryStages, job: SearchJob) -> Result:
     of_name = {PREPARE: stages.prepare, COARSE: stages.coarse, REFINE: stages.refine}
     while True:
         (result,) = of_name[job.step.stage]([job])
@@ -279,26 +284,10 @@ def _compute(stages: QueryStages, job: QueryJob) -> Result:
         job.step = result.steps[0]
 
 
-def given_up(stages: Sequence[str], tiers: Sequence[Tier]) -> Callable[[QueryRun], bool]:
-    """Which further searches had no time, of an answer with these stages.
-
-    The first tier may search twice more: the whole scene, and the photograph turned. The first of these was finished if
-    the answer has other stages of it.
-    """
-    unfinished = {it.removesuffix(UNFINISHED) for it in stages if it.endswith(UNFINISHED)}
-    finished = _searched_again([it for it in stages if not it.endswith(UNFINISHED)])
-
-    def is_given_up(run: QueryRun) -> bool:
-        features = tiers[run.tier].features
-        has_searched = run.best is not None and features in _searched_again(run.best.stage_seconds)
-        return features in unfinished and has_searched == (features in finished)
-
-    return is_given_up
-
-
-def _searched_again(stages: Iterable[str]) -> set[str]:
-    """Extractors of further searches that were finished."""
-    return {it.rpartition("/")[0] for it in stages} - {""}
+def given_up(then: pb.Diagnostics, tiers: Sequence[Tier]) -> Callable[[Search], bool]:
+    """Which further attempts had no time, of an answer with these diagnostics."""
+    unfinished = {(it.rung, it.features) for it in then.attempts if it.outcome == "unfinished"}
+    return lambda search: (search.rung, tiers[search.attempt.features].features) in unfinished
 
 
 def _is_cut_short(request: Any, then: Response) -> bool:

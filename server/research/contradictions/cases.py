@@ -193,7 +193,7 @@ def _three(i: int, forms: Sequence[tuple[str, Priors]]) -> list[tuple[str, Prior
 
 def _priors_about(place: Place, pose: RigidTransform, frame: Frame, seed: str) -> dict[str, Priors]:
     """Soft priors of each kind, tight and loose, off a pose by random errors of their standard deviations."""
-    random, found = np.random.default_rng(crc32(seed.encode())), {}
+    random, found = np.random.default_rng(crc32(seed.encode())), dict[str, Priors]()
     for name, (radii, sigma_deg) in (("tight", TIGHT), ("loose", LOOSE)):
         sigma = radii * place.radius
         off = pose.translation + sigma * random.standard_normal(3)

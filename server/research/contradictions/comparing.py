@@ -71,10 +71,10 @@ def is_expected(row: Row) -> bool:
     if outcome == "wrong" or outcome.startswith("failed"):
         return False
     if expected == Expected.AMBIGUOUS:
-        return outcome == "AMBIGUOUS" and len(row["hypotheses"]) == 2
+        return bool(outcome == "AMBIGUOUS" and len(row["hypotheses"]) == 2)
     return {
-        Expected.RIGHT: outcome == "right",
-        Expected.REJECTED: outcome != "right",
+        Expected.RIGHT: bool(outcome == "right"),
+        Expected.REJECTED: bool(outcome != "right"),
         Expected.RIGHT_OR_REJECTED: True,
     }[Expected(expected)]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.bundle.estimate import Support
+from mapless_server.method.bundle.estimate import PosedSupport, Support
 from mapless_server.method.bundle.priors import NO_PRIORS, Priors
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import make_extractor
@@ -177,7 +177,7 @@ def _error(pair: Pair, answer: Answer) -> tuple[float, float] | None:
     """Errors of the pose that is answered, or that was found and rejected; None without a pose."""
     if isinstance(answer.outcome, Localization):
         pose = answer.outcome.world_from_camera
-    elif answer.support is not None and answer.support.estimate is not None:
+    elif isinstance(answer.support, PosedSupport):
         pose = answer.support.estimate.world_from_camera.shifted(answer.support.origin)
     else:
         return None

@@ -350,7 +350,7 @@ def rejection_of(
     evidence = IntrinsicsEvidence(given, given, value, usual, usual, np.zeros((4, 4)), np.zeros((6, 4)), zero)
     nothing = tuple(np.empty((0, 2), np.int32) for _ in scene.references)
     estimate = replace(estimate, intrinsics=evidence)
-    support = Support(query, scene.references, structure, matches, estimate, np.zeros(3), None, nothing, stated)
+    support = Support(query, scene.references, structure, matches, np.zeros(3), nothing, stated).posed(estimate)
     return wrong_camera(support, "a", is_doubted=is_weak), true
 
 
@@ -488,6 +488,6 @@ def test_another_camera_must_be_clearly_better(count: int, share: float, gain: f
     doubted = IntrinsicsEvidence(camera, camera, 5 * usual, usual, usual, np.zeros((4, 4)), np.zeros((6, 4)), zero)
     estimate = PoseEstimate(scene.world_from_query, PoseStage.REFINED, inliers, zero, np.eye(6), intrinsics=doubted)
     nothing = tuple(np.empty((0, 2), np.int32) for _ in scene.references)
-    support = Support(query, scene.references, structure, matches, estimate, np.zeros(3), None, nothing)
+    support = Support(query, scene.references, structure, matches, np.zeros(3), nothing).posed(estimate)
     rejection = wrong_camera(support, "a")
     assert (rejection is not None) == is_named

@@ -29,7 +29,7 @@ from mapless_server.method.bundle.dispersion import (
     dispersed_covariance,
     scale_covariance,
 )
-from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
+from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage, Support
 from mapless_server.method.bundle.pose_problem import (
     DRIFT_INFLATION,
     OWN_INFLATION,
@@ -89,7 +89,7 @@ def adjusted_poses(
         noisy = drifted(noisy, centre, random, drift * planted.distance_m, np.degrees(drift))
         structure, matches, estimate = stages(scene, noisy)
         adjusted = adjust_pose(scene.query, noisy, structure, matches, estimate, AdjustOptions(uncertainty=options))
-        support = Support(scene.query, noisy, structure, matches, adjusted, np.zeros(3))
+        support = Support(scene.query, noisy, structure, matches, np.zeros(3)).posed(adjusted)
         query_matches = true_correspondences(scene).query_matches
         halves = evidence_of(support, votes_of(support, query_matches), query_matches)
         covered = with_halves(adjusted, halves.disagreement * support.distance_m())
@@ -117,9 +117,9 @@ def test_drift_of_reference_poses_is_found_in_part() -> None:
 
 def support_of(
     scene: SyntheticScene, structure: Structure, estimate: PoseEstimate, options: UncertaintyOptions = PLAIN
-) -> Support:
+) -> PosedSupport:
     matches = true_structure(scene)[1]
-    return Support(scene.query, scene.references, structure, matches, estimate, np.zeros(3))
+    return Support(scene.query, scene.references, structure, matches, np.zeros(3)).posed(estimate)
 
 
 def test_covariance_of_scale_noise_equals_sampling() -> None:

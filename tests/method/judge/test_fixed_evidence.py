@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
+from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage, Support
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import Features, PosedView, View
 from mapless_server.method.judge.fixed import moved_matches, unmoved_failure
@@ -36,7 +36,7 @@ def pairs(n: int) -> NDArray[np.int32]:
     return np.repeat(np.arange(n, dtype=np.int32)[:, None], 2, axis=1)
 
 
-def support_of(query: Array, seen: list[Array], matched: int) -> Support:
+def support_of(query: Array, seen: list[Array], matched: int) -> PosedSupport:
     """Every keypoint is an inlier on a point that all references see at the same index; so many match a reference."""
     n, references = len(query), tuple(posed(it, i) for i, it in enumerate(seen))
     point, view = np.repeat(np.arange(n), len(seen)), np.tile(np.arange(len(seen)), n)
@@ -45,7 +45,7 @@ def support_of(query: Array, seen: list[Array], matched: int) -> Support:
     pose = RigidTransform(np.eye(3), np.zeros(3))
     estimate = PoseEstimate(pose, PoseStage.REFINED, np.ones(n, bool), np.zeros(n), np.eye(6))
     of_query = tuple(pairs(matched) for _ in seen)
-    return Support(view_of(query), references, structure, matches, estimate, np.zeros(3), None, of_query)
+    return Support(view_of(query), references, structure, matches, np.zeros(3), of_query).posed(estimate)
 
 
 def pixels(seed: str, size: tuple[float, float] = (960.0, 720.0), n: int = COUNT) -> Array:

@@ -9,7 +9,7 @@ from support.pnp_problems import POSE, problem_of
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform
-from mapless_server.method.bundle.estimate import PoseEstimate, Support
+from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, Support
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge import evidence as halves_of
 from mapless_server.method.judge.evidence import (
@@ -46,18 +46,18 @@ POOR = Evidence(22, 102, 0.1, 0.6, 0.04, 0.1, 0.3, 0.2)
 """Such a pose was off by a tenth of the distance to the photograph's contents."""
 
 
-def support_of(outlier_share: float = 0.0, seen_share: float = 0.9) -> Support:
+def support_of(outlier_share: float = 0.0, seen_share: float = 0.9) -> PosedSupport:
     """A planted photograph, solved."""
     options = SceneOptions(point_count=300, outlier_share=outlier_share, seen_share=seen_share)
     return solved(make_scene(random_for("judge", outlier_share, seen_share), options))
 
 
-def verdict(support: Support, coverage: float, options: JudgeOptions = OPTIONS) -> tuple[float, Rejection | None]:
+def verdict(support: PosedSupport, coverage: float, options: JudgeOptions = OPTIONS) -> tuple[float, Rejection | None]:
     judged = judge(support, query_matches_of(support), coverage, options)
     return judged.trust, judged.rejection
 
 
-def query_matches_of(support: Support) -> list[Matches]:
+def query_matches_of(support: PosedSupport) -> list[Matches]:
     """The matches with each reference that the support's matches come from."""
     tracks, matches = support.structure.tracks, support.matches
     keypoint_of = np.full(len(support.structure.x_in_world), -1)
@@ -86,7 +86,7 @@ def test_poses_from_degenerate_points_are_rejected(shape: str, count: int) -> No
         if isinstance(estimate, Rejection):
             continue
         reference = PosedView("key", "scenes/s/references/r", query, POSE)
-        support = Support(query, (reference,), structure, matches, estimate, np.zeros(3))
+        support = Support(query, (reference,), structure, matches, np.zeros(3)).posed(estimate)
         rejection = judge(support, [np.empty((0, 2), np.int32)], COVERAGE, OPTIONS).rejection
         assert rejection is not None
 
@@ -140,7 +140,7 @@ def test_worse_matches_and_fewer_points_lower_the_trust() -> None:
     assert clean > sparse
 
 
-def evidence(support: Support) -> Evidence:
+def evidence(support: PosedSupport) -> Evidence:
     matches = query_matches_of(support)
     return evidence_of(support, votes_of(support, matches), matches)
 
@@ -250,14 +250,14 @@ def scene_of(case: object, **options: object) -> SyntheticScene:
     return make_scene(random_for("agreement", case), replace(SceneOptions(point_count=300), **options))  # type: ignore[arg-type]
 
 
-def solved(scene: SyntheticScene) -> Support:
+def solved(scene: SyntheticScene) -> PosedSupport:
     structure, matches = true_structure(scene)
     estimate = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
     assert isinstance(estimate, PoseEstimate)
-    return Support(scene.query, scene.references, structure, matches, estimate, np.zeros(3))
+    return Support(scene.query, scene.references, structure, matches, np.zeros(3)).posed(estimate)
 
 
-def both(scene: SyntheticScene, support: Support) -> tuple[float, float]:
+def both(scene: SyntheticScene, support: PosedSupport) -> tuple[float, float]:
     votes = votes_of(support, true_correspondences(scene).query_matches)
     return (
         disagreement_of_matches(support, DISTANCE_M),

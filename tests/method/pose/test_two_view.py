@@ -13,7 +13,7 @@ from support.scenes import CAMERA, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.bundle.dispersion import UncertaintyOptions
-from mapless_server.method.bundle.estimate import Support
+from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.bundle.pose_problem import AdjustOptions
 from mapless_server.method.bundle.priors import PosePrior, Priors
 from mapless_server.method.bundle.unknowns import IntrinsicsSigma
@@ -54,11 +54,11 @@ class Planted:
     references: tuple[PosedView, ...]
     correspondences: Correspondences
 
-    def solved(self, intrinsics: IntrinsicsSigma | None = None) -> Support | None:
+    def solved(self, intrinsics: IntrinsicsSigma | None = None) -> PosedSupport | None:
         stages = StructureOptions(), MatchOptions(), AdjustOptions(), intrinsics
         return solve_two_view(self.query, self.references, self.correspondences, (), ORIGIN, *stages)
 
-    def evidence(self, support: Support) -> TwoViewEvidence:
+    def evidence(self, support: PosedSupport) -> TwoViewEvidence:
         return two_view_evidence(support, self.correspondences.query_matches)
 
 
@@ -129,7 +129,7 @@ def error_of(pose: RigidTransform) -> Array:
     return np.concatenate([pose.translation - TRUE.translation, rotation_vector(pose.rotation @ TRUE.rotation.T)])
 
 
-def pose_of(support: Support | None) -> RigidTransform:
+def pose_of(support: PosedSupport | None) -> RigidTransform:
     assert support is not None
     assert support.estimate is not None
     return support.estimate.world_from_camera
@@ -285,7 +285,7 @@ def test_cameras_that_the_caller_allows_are_not_compared() -> None:
         assert wrong_camera(support, "a") is None
 
 
-def without_evidence(support: Support) -> Support:
+def without_evidence(support: PosedSupport) -> PosedSupport:
     """Whose equations of the errors of the intrinsics are singular."""
     assert support.estimate is not None
     return replace(support, estimate=replace(support.estimate, intrinsics=None))

@@ -8,6 +8,7 @@ from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
 from mapless_server.method.bundle.bundle import BundleProblem, bundle_of
+from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import Features, KeptDepth, KeypointDepths, PosedView
 from mapless_server.method.judge.answer import Localization
@@ -152,10 +153,12 @@ def test_references_that_share_nothing_give_points_by_depth() -> None:
         for has_depths in (False, True)
     }
     alone = answers[False]
-    assert not isinstance(alone.outcome, Localization) or (alone.support and alone.support.two_view is not None)
+    if isinstance(alone.outcome, Localization):
+        assert isinstance(alone.support, PosedSupport)
+        assert alone.support.two_view is not None
     outcome, support = answers[True].outcome, answers[True].support
     assert isinstance(outcome, Localization)
-    assert support is not None
+    assert isinstance(support, PosedSupport)
     assert support.two_view is None
     assert np.linalg.norm(outcome.world_from_camera.translation - SCENE.world_from_query.translation) < 0.02
 

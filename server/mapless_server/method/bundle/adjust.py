@@ -25,7 +25,7 @@ from ..features.views import Matches, PosedView, View
 from ..structure.model import MetricScale, PointMatches, Structure
 from ..structure.structure import query_tracks, with_query_points
 from .dispersion import scale_covariance
-from .estimate import PoseEstimate, PoseStage, Support
+from .estimate import PosedSupport, PoseEstimate, PoseStage
 from .intrinsics import IntrinsicsTerms
 from .pose_problem import (
     AdjustInput,
@@ -191,7 +191,7 @@ def intrinsics_terms(
 
 
 def with_covariance(
-    support: Support,
+    support: PosedSupport,
     scale: MetricScale,
     options: AdjustOptions,
     priors: Priors = NO_PRIORS,
@@ -213,8 +213,6 @@ def with_covariance(
         ValueError: there is no estimate.
     """
     estimate, references = support.estimate, support.references
-    if estimate is None:
-        raise ValueError("support.estimate must not be None")
     if estimate.is_adjusted:
         return estimate
     used = np.flatnonzero(estimate.errors_px < options.max_error_px)

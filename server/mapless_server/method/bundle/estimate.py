@@ -83,7 +83,7 @@ class TwoViewSupport:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """The data that a pose is estimated from, and the estimate.
+    """The data that a pose is estimated from.
 
     Everything is in a world whose origin is the camera centre of the first reference.
 
@@ -92,9 +92,7 @@ class Support:
         references: the references, in the order of the structure's tracks.
         structure: metric points and the references' keypoints that observe them.
         matches: matches of the query with the points.
-        estimate: pose and inliers; None without a pose.
         origin: (3,) origin of this world in the caller's world, metres.
-        two_view: matches with single references, where the pose rests on them too.
         query_matches: matches of the query with each reference.
         intrinsics_sigma: the caller's standard deviations of the query's intrinsics; None for the usual ones.
         reference_error_px: returns the error of a pair of references, see `agreement`; None if it is not known.
@@ -104,22 +102,40 @@ class Support:
     references: tuple[PosedView, ...]
     structure: Structure
     matches: PointMatches
-    estimate: PoseEstimate | None
     origin: Array
-    two_view: TwoViewSupport | None = None
     query_matches: tuple[Matches, ...] = ()
     intrinsics_sigma: IntrinsicsSigma | None = None
     reference_error_px: ReferenceErrors | None = None
 
+    def posed(self, estimate: PoseEstimate, two_view: TwoViewSupport | None = None) -> PosedSupport:
+        """The same data with the pose that is estimated from them, and the photograph's view by its intrinsics."""
+        given = vars(self) | {"query": estimate.view or self.query}
+        return PosedSupport(**given, estimate=estimate, two_view=two_view)
+
+    def inliers_by_reference(self) -> tuple[int, ...]:
+        """Number of inliers on points that each reference observes; 0 without a pose."""
+        return (0,) * len(self.references)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PosedSupport(Support):
+    """The data that a pose is estimated from, and the estimate.
+
+    Attributes:
+        estimate: pose and inliers.
+        two_view: matches with single references, where the pose rests on them too.
+    """
+
+    estimate: PoseEstimate
+    two_view: TwoViewSupport | None = None
+
     def inlier_count(self) -> int:
         """Number of inliers of the estimate, two-view inliers included."""
-        assert self.estimate is not None
         of_two_views = 0 if self.two_view is None else int(self.two_view.inliers.sum())
         return int(self.estimate.inliers.sum()) + of_two_views
 
     def distance_m(self) -> float:
         """Median depth of the inliers' points at the estimate; always positive."""
-        assert self.estimate is not None
         x_in_world = self.structure.x_in_world[self.matches.point[self.estimate.inliers]]
         if self.two_view is not None:
             x_in_world = np.concatenate([x_in_world, self.two_view.x_in_world[self.two_view.inliers]])
@@ -128,12 +144,9 @@ class Support:
 
     def inliers_by_reference(self) -> tuple[int, ...]:
         """Number of inliers on points that each reference observes, and of two-view inliers with it."""
-        count = len(self.references)
-        if self.estimate is None:
-            return (0,) * count
         agreeing = np.zeros(len(self.structure.x_in_world), bool)
         agreeing[self.matches.point[self.estimate.inliers]] = True
         seen = self.structure.tracks.view[agreeing[self.structure.tracks.point]]
         if self.two_view is not None:
             seen = np.concatenate([seen, self.two_view.reference[self.two_view.inliers]])
-        return tuple(np.bincount(seen, minlength=count).tolist())
+        return tuple(np.bincount(seen, minlength=len(self.references)).tolist())

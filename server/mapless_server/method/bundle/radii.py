@@ -9,7 +9,7 @@ from scipy.special import gammaincinv
 
 from mapless.geometry import Array
 
-from .estimate import PoseEstimate, Support
+from .estimate import PosedSupport, PoseEstimate
 
 TAIL_95 = 1.47
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Measured once (server/research)."""
@@ -125,13 +125,11 @@ SUPPORTING_SHARE = 0.1
 """References with fewer inliers, by those of the one with the most, do not hold the pose."""
 
 
-def viewpoint_gap(support: Support) -> tuple[float, float]:
+def viewpoint_gap(support: PosedSupport) -> tuple[float, float]:
     """Distance to the nearest reference that holds the pose, over the median depth of the inliers; and that depth.
 
     ValueError if there is no estimate.
     """
-    if support.estimate is None:
-        raise ValueError("support.estimate must not be None")
     pose, counts = support.estimate.world_from_camera, np.array(support.inliers_by_reference())
     points = [support.structure.x_in_world[support.matches.point[support.estimate.inliers]]]
     if support.two_view is not None:

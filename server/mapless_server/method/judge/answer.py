@@ -9,7 +9,6 @@ from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import PoseEstimate, PoseStage, Support, TwoViewSupport
 from ..bundle.priors import PriorCheck
-from ..bundle.radii import accuracy_from_covariance
 from ..rejection import IntrinsicsCheck, Rejection
 from ..structure.model import MetricScale, ScaleSource
 
@@ -118,19 +117,3 @@ def shifted(answer: Answer, offset: Array) -> Answer:
             scale, world_from_local=world_from_local, world_from_query=scale.world_from_query.shifted(offset)
         )
     return replace(answer, outcome=outcome, scale=scale)
-
-
-def is_better(wide: Answer, strict: Answer, max_radius_ratio: float) -> bool:
-    """Whether the answer from wide correspondences is better; its radius may be `max_radius_ratio` times as large."""
-    if isinstance(wide.outcome, Rejection) or isinstance(strict.outcome, Rejection):
-        return isinstance(wide.outcome, Localization)
-    if wide.outcome.inlier_count <= strict.outcome.inlier_count:
-        return False
-    return _position_radius_m(wide) <= max_radius_ratio * _position_radius_m(strict)
-
-
-def _position_radius_m(answer: Answer) -> float:
-    """Radius of the position at 68 % from the covariance, metres; infinite without a covariance."""
-    if isinstance(answer.outcome, Rejection) or answer.outcome.covariance is None:
-        return math.inf
-    return accuracy_from_covariance(answer.outcome.covariance).position_68_m

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Fisheye
 
-from ..bundle.estimate import Support
+from ..bundle.estimate import PosedSupport
 from ..bundle.intrinsics import IntrinsicsEvidence, corrected, read_as
 from ..bundle.unknowns import IntrinsicsSigma
 from ..features.views import View
@@ -87,14 +87,14 @@ class _Compared:
     They are of every `step`-th keypoint, and so are the views: reading these with other lenses takes long.
     """
 
-    support: Support
+    support: PosedSupport
     step: int
     lines: TwoViewMatches
     x_in_world: Array
     keypoint: NDArray[np.intp]
 
     @staticmethod
-    def of(support: Support) -> "_Compared":
+    def of(support: PosedSupport) -> "_Compared":
         matches, lines = support.matches, TwoViewMatches.of(support.query, support.references, support.query_matches)
         step = 1 + len(lines) // MAX_LINES
         used = np.flatnonzero(~matches.guided & (matches.keypoint % step == 0))
@@ -133,7 +133,7 @@ class _Compared:
         return value / MIN_GAIN if is_bent else value, camera
 
 
-def wrong_camera(support: Support, best_reference: str, is_doubted: bool = False) -> Rejection | None:
+def wrong_camera(support: PosedSupport, best_reference: str, is_doubted: bool = False) -> Rejection | None:
     """A rejection that names what is wrong and the better value, if a pose of another camera scores clearly higher.
 
     A pose that rests on matches without points is compared whatever the linear check says, with few cameras by a brief
@@ -141,7 +141,6 @@ def wrong_camera(support: Support, best_reference: str, is_doubted: bool = False
     are those of an image of half or twice the size. What speaks against the camera of a pose that is doubted for lack
     of evidence is named, but without the checks that keep stronger features from being tried, unless it is very clear.
     """
-    assert support.estimate is not None
     query, evidence, by_lines = support.query, support.estimate.intrinsics, support.two_view is not None
     count = int((~support.matches.guided).sum())
     if not by_lines and (count < MIN_MATCHES or evidence is None or not _is_doubtful(evidence)):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle.estimate import Support
+from ..bundle.estimate import PosedSupport, Support
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import cauchy_weight
 from ..optim.perturbation import pose_jacobian
@@ -110,7 +110,7 @@ def votes_on(
     return Votes(reference[known], keypoint, seen)
 
 
-def disagreement_of_matches(support: Support, distance_m: float) -> float:
+def disagreement_of_matches(support: PosedSupport, distance_m: float) -> float:
     """Distance between the cameras that random halves of the matches give, as a share of `distance_m`; at most 1."""
     seen = support.matches.unguided().seen(support.query, support.structure.x_in_world)
 
@@ -120,7 +120,7 @@ def disagreement_of_matches(support: Support, distance_m: float) -> float:
     return _median_disagreement(seen, random_half, distance_m, _pose(support))
 
 
-def disagreement_of_references(support: Support, votes: Votes, distance_m: float) -> float:
+def disagreement_of_references(support: PosedSupport, votes: Votes, distance_m: float) -> float:
     """The same distance for matches with one half of the references and with the other half.
 
     The halves have about as many matches each; of several matches of a keypoint within a half the first counts.
@@ -143,8 +143,7 @@ def half_of_references(counts: NDArray[np.intp], random: np.random.Generator) ->
     return in_first
 
 
-def _pose(support: Support) -> RigidTransform:
-    assert support.estimate is not None
+def _pose(support: PosedSupport) -> RigidTransform:
     return support.estimate.world_from_camera
 
 
@@ -271,7 +270,7 @@ class Evidence:
         return math.log(found * hull * epipolar / max(LEAST_DISAGREEMENT, self.disagreement))
 
 
-def evidence_of(support: Support, votes: Votes, query_matches: Sequence[Matches]) -> Evidence:
+def evidence_of(support: PosedSupport, votes: Votes, query_matches: Sequence[Matches]) -> Evidence:
     """Computes the evidence for the estimate of a support.
 
     Args:
@@ -283,7 +282,7 @@ def evidence_of(support: Support, votes: Votes, query_matches: Sequence[Matches]
         ValueError: there is no such estimate.
     """
     estimate, query, structure, matches = support.estimate, support.query, support.structure, support.matches
-    if estimate is None or estimate.inliers.sum() < 4:
+    if estimate.inliers.sum() < 4:
         raise ValueError("support.estimate must have at least 4 inliers")
     inliers, pose = estimate.inliers, estimate.world_from_camera
     distance_m = support.distance_m()

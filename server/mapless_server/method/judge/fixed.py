@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle.estimate import Support
+from ..bundle.estimate import PosedSupport
 from ..features.tracks import keypoint_offsets
 from ..features.views import Matches, PosedView, View
 from ..pairs.stationary import (
@@ -26,7 +26,7 @@ from ..structure.model import PointMatches, Structure
 
 
 def unmoved_failure(
-    support: Support, inlier_px: float, options: StationaryOptions, log10_chance: float = 0.0
+    support: PosedSupport, inlier_px: float, options: StationaryOptions, log10_chance: float = 0.0
 ) -> str | None:
     """Says in one sentence that a pose rests on what may be fixed to the camera; None if it passes without that.
 

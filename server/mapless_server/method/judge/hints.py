@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..bundle.estimate import PosedSupport
 from ..features.views import PosedView, View
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .answer import Answer
@@ -75,7 +76,6 @@ def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_pri
     rejection = answer.outcome
     if not isinstance(rejection, Rejection) or rejection.hint is not None:
         return answer
-    estimate = answer.support.estimate if answer.support else None
     matches = answer.reference_match_counts
     best = int(np.argmax(matches)) if any(matches) else None
     most, second = sorted((*matches, 0, 0), reverse=True)[:2]
@@ -84,7 +84,7 @@ def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_pri
         len(query.features),
         most,
         second,
-        0 if estimate is None else int(estimate.inliers.sum()),
+        int(answer.support.estimate.inliers.sum()) if isinstance(answer.support, PosedSupport) else 0,
         rejection.tried if answer.support is None else len(answer.support.matches),
         None if best is None else references[best].name,
         len(references),

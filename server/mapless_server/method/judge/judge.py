@@ -39,13 +39,13 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
 from mapless_server.bounds import check_bounds
 
-from ..bundle.estimate import Support
+from ..bundle.estimate import PosedSupport
 from ..bundle.intrinsics import ContradictionOptions
 from ..bundle.radii import Accuracy, accuracy_from_covariance
 from ..features.views import Matches
 from ..optim.perturbation import pose_hessian, world_covariance
 from ..pose.pnp import PnpOptions, false_alarms, ransac
-from ..rejection import Advice, Hint, Hypothesis, Rejection, RejectionReason
+from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .cameras import wrong_camera
 from .evidence import Evidence, Votes, evidence_of, votes_of
 from .intrinsics import wrong_intrinsics
@@ -129,7 +129,7 @@ class Judgement:
 
 
 def judge(
-    support: Support,
+    support: PosedSupport,
     query_matches: Sequence[Matches],
     coverage: float,
     options: JudgeOptions,
@@ -161,7 +161,7 @@ def judge(
 
 
 def contradiction(
-    support: Support,
+    support: PosedSupport,
     votes: Votes,
     options: JudgeOptions,
     is_doubted: bool = False,
@@ -171,7 +171,6 @@ def contradiction(
 
     For one that is doubted for lack of evidence see `wrong_camera`.
     """
-    assert support.estimate is not None
     if disagreeing := disagreeing_references([supporters_of(support)]):
         return disagreeing
     evidence = support.estimate.intrinsics
@@ -219,9 +218,8 @@ def format_evidence(evidence: Evidence) -> str:
     )
 
 
-def _too_uncertain(support: Support, options: JudgeOptions) -> Rejection | None:
+def _too_uncertain(support: PosedSupport, options: JudgeOptions) -> Rejection | None:
     """Rejects a pose whose own radius says that it may well be wrong."""
-    assert support.estimate is not None
     share = accuracy_from_covariance(support.estimate.covariance).position_68_m / support.distance_m()
     if share <= options.max_radius_share:
         return None
@@ -235,7 +233,7 @@ def _too_uncertain(support: Support, options: JudgeOptions) -> Rejection | None:
     return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.ADD_REFERENCES, advice, names[0]))
 
 
-def _ambiguous(hypotheses: tuple[Hypothesis, Hypothesis], unit: str) -> Rejection:
+def _ambiguous(hypotheses: tuple[PoseHypothesis, PoseHypothesis], unit: str) -> Rejection:
     first, second = sorted(hypotheses, key=lambda it: -it.inlier_count)
     apart = math.dist(first.world_from_camera.translation, second.world_from_camera.translation)
     message = (
@@ -245,7 +243,7 @@ def _ambiguous(hypotheses: tuple[Hypothesis, Hypothesis], unit: str) -> Rejectio
     return Rejection(RejectionReason.AMBIGUOUS, message, hypotheses=(first, second))
 
 
-def find_rival(support: Support, votes: Votes) -> tuple[Hypothesis, Hypothesis] | None:
+def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, PoseHypothesis] | None:
     """Finds the first pose and its rival, as hypotheses in the support's world; None without a rival.
 
     Projects all matches, and searches only if enough of them are outliers.
@@ -255,8 +253,6 @@ def find_rival(support: Support, votes: Votes) -> tuple[Hypothesis, Hypothesis] 
         votes: the query's matches with each reference.
     """
     estimate, camera = support.estimate, support.query.camera
-    if estimate is None:
-        return None
     errors_px = votes.seen.errors_px(estimate.world_from_camera)
     own = errors_px < RIVAL_PNP.inlier_px
     wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(RIVAL_MIN_SHARE * votes.keypoint_count(own))))
@@ -276,8 +272,8 @@ def find_rival(support: Support, votes: Votes) -> tuple[Hypothesis, Hypothesis] 
         return None
     names = [reference.name for reference in support.references]
     return (
-        Hypothesis(estimate.world_from_camera, votes.keypoint_count(own), _supporters(names, counts[0], counts[1])),
-        Hypothesis(pose, votes.keypoint_count(theirs), _supporters(names, counts[1], counts[0])),
+        PoseHypothesis(estimate.world_from_camera, votes.keypoint_count(own), _supporters(names, counts[0], counts[1])),
+        PoseHypothesis(pose, votes.keypoint_count(theirs), _supporters(names, counts[1], counts[0])),
     )
 
 

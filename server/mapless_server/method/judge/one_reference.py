@@ -22,7 +22,6 @@ def trust_of_score(score: float) -> float:
 
 def one_reference_failure(found: Found, trust: float, coverage: float) -> str | None:
     """Says in one sentence why a pose is not accepted; None if it is."""
-    assert found.support.estimate is not None
     inliers = found.support.estimate.inliers
     count = f"{inliers.sum()} of {len(inliers)} matches agree on a pose"
     if -found.score > MAX_LOG10_FALSE_ALARMS:

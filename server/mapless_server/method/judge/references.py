@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-from ..bundle.estimate import Support
+from ..bundle.estimate import PosedSupport
 from ..features.views import ReferenceErrors
 from ..pairs.agreement import MAX_ERROR_PX
 from ..rejection import Advice, Hint, Rejection, RejectionReason
@@ -35,7 +35,7 @@ class Supporters:
     error_px: ReferenceErrors | None
 
 
-def supporters_of(support: Support) -> Supporters:
+def supporters_of(support: PosedSupport) -> Supporters:
     """The references that support the estimate of a support."""
     names = [reference.name for reference in support.references]
     return Supporters(names, support.inliers_by_reference(), support.reference_error_px)

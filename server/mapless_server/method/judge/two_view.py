@@ -19,7 +19,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from ..bundle.estimate import Support, TwoViewSupport
+from ..bundle.estimate import PosedSupport, TwoViewSupport
 from ..features.views import Matches
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..pose.pnp import false_alarms, format_false_alarms, log10_tail
@@ -75,7 +75,7 @@ class TwoViewEvidence:
     hull_share: float
 
 
-def two_view_evidence(support: Support, query_matches: Sequence[Matches]) -> TwoViewEvidence:
+def two_view_evidence(support: PosedSupport, query_matches: Sequence[Matches]) -> TwoViewEvidence:
     """Computes the evidence for the estimate of a support with two-view matches.
 
     Args:
@@ -86,8 +86,8 @@ def two_view_evidence(support: Support, query_matches: Sequence[Matches]) -> Two
         ValueError: there is no estimate, or there are no two-view matches.
     """
     estimate, lines, matches, camera = support.estimate, support.two_view, support.matches, support.query.camera
-    if estimate is None or lines is None:
-        raise ValueError("support.estimate and support.two_view must not be None")
+    if lines is None:
+        raise ValueError("support.two_view must not be None")
     disc, band = disc_chance(camera, INLIER_PX), band_chance(camera, EPIPOLAR_PX)
     # Matches searched near a pose agree with it by construction.
     points = int((~matches.guided).sum()), int((estimate.inliers & ~matches.guided).sum())
@@ -115,14 +115,16 @@ def two_view_evidence(support: Support, query_matches: Sequence[Matches]) -> Two
     )
 
 
-def without_unmoved(support: Support, query_matches: Sequence[Matches], options: StationaryOptions) -> Support:
+def without_unmoved(
+    support: PosedSupport, query_matches: Sequence[Matches], options: StationaryOptions
+) -> PosedSupport:
     """The support without matches at the same pixels as in the references, which may be fixed to the camera.
 
     The arguments are those of `two_view_evidence`, and the largest displacement of what is fixed.
     """
     estimate, lines, query, references = support.estimate, support.two_view, support.query, support.references
-    if estimate is None or lines is None:
-        raise ValueError("support.estimate and support.two_view must not be None")
+    if lines is None:
+        raise ValueError("support.two_view must not be None")
     points = moved_matches(query, references, support.structure, support.matches, query_matches, options)
     rows = np.ones(len(lines.reference), bool)
     for i, reference in enumerate(references):
@@ -161,7 +163,7 @@ def two_view_failure(evidence: TwoViewEvidence) -> str | None:
     return None
 
 
-def one_reference_rejection(reason: RejectionReason, message: str, support: Support) -> Rejection:
+def one_reference_rejection(reason: RejectionReason, message: str, support: PosedSupport) -> Rejection:
     """Makes the rejection of a pose without a distance, with its hint."""
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     advice = (

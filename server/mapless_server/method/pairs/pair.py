@@ -54,6 +54,16 @@ class Matching(Enum):
             return None
         return Matching.STRONG if self is Matching.STRONG_WIDE else Matching.STRICT
 
+    @property
+    def widened(self) -> "Matching":
+        """The matching that adds matches along the epipolar lines to this one's."""
+        return Matching.STRONG_WIDE if self.is_strong else Matching.WIDE
+
+    @property
+    def narrow(self) -> "Matching":
+        """The matching without matches along the epipolar lines."""
+        return Matching.STRONG if self.is_strong else Matching.STRICT
+
 
 class PairMatches(NamedTuple):
     """The matches of two references.

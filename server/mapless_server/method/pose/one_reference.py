@@ -22,7 +22,7 @@ from mapless.geometry import Array, RigidTransform, normalize_jacobian
 from mapless_server.bounds import check_bounds
 
 from ..bundle.dispersion import scale_covariance
-from ..bundle.estimate import PoseEstimate, PoseStage, Support
+from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, Reconstruction, View
 from ..optim.perturbation import motion_jacobian, perturbed, world_covariance
@@ -84,7 +84,7 @@ class Found:
         moved_score: the same for those matches that are at other pixels than in the reference; see `judge.fixed`.
     """
 
-    support: Support
+    support: PosedSupport
     score: float
     moved_score: float
 
@@ -130,7 +130,7 @@ def solve_one_reference(
         replace(FIRST_GUESS, level_px=solved.sigma_px),
     )
     found = PointMatches(rows, matches[:, 0].astype(np.intp), np.zeros(len(rows), bool), 0.0)
-    support = Support(query, tuple(references), structure, found, estimate, origin)
+    support = PosedSupport(query, tuple(references), structure, found, origin, estimate=estimate)
     moved = are_moved(query, reference, matches, matches, stationary)
     return Found(support, score_of(problem, solved, options), score_of(*_of_rows(problem, solved, moved), options))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.adjust import adjust_pose
-from ..bundle.estimate import PoseEstimate, PoseStage, Support, TwoViewSupport
+from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage, TwoViewSupport
 from ..bundle.pose_problem import AdjustOptions
 from ..bundle.unknowns import IntrinsicsSigma
 from ..features.tracks import Tracks
@@ -50,12 +50,12 @@ def solve_two_view(
     match_options: MatchOptions,
     adjust_options: AdjustOptions,
     intrinsics: IntrinsicsSigma | None = None,
-) -> Support | None:
+) -> PosedSupport | None:
     """Finds the pose that most matches of both kinds support, with these matches; None if there is none.
 
     There are two or more references, and matches between all photographs. The poses world_from_query of other stages,
-    `known`, are candidates too; for `origin` (3,) of their world see `Support`. `intrinsics` are standard deviations
-    of those of the query; None for the defaults.
+    `known`, are candidates too; for `origin` (3,) of their world see `Support`. `intrinsics` are standard deviations of
+    those of the query; None for the defaults.
     """
     structure = triangulated_structure(references, correspondences, structure_options)
     matches = vote(structure, [len(it.view.features) for it in references], correspondences)
@@ -74,8 +74,18 @@ def solve_two_view(
         best = adjusted
     if best.estimate is None or best.inlier_count < MIN_INLIERS:
         return None
-    matched = best.support, tuple(correspondences.query_matches), intrinsics, correspondences.reference_error_px
-    return Support(query, tuple(references), structure, searched, best.estimate, origin, *matched)
+    return PosedSupport(
+        query,
+        tuple(references),
+        structure,
+        searched,
+        origin,
+        tuple(correspondences.query_matches),
+        intrinsics,
+        correspondences.reference_error_px,
+        estimate=best.estimate,
+        two_view=best.support,
+    )
 
 
 @dataclass(frozen=True, eq=False)

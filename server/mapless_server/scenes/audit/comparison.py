@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
-from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
+from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge.judge import JudgeOptions, judge
 from mapless_server.method.optim.perturbation import world_covariance
@@ -183,7 +183,7 @@ class Comparison:
             fit.world_from_camera, PoseStage.REFINED, fit.inliers, fit.error_px, self._covariance_of(fit)
         )
         query, hood = replace(self.subject.view, camera=fit.camera), self.neighbourhood
-        support = Support(query, hood.references, hood.structure, self.matches, estimate, np.zeros(3))
+        support = PosedSupport(query, hood.references, hood.structure, self.matches, np.zeros(3), estimate=estimate)
         rejection = judge(support, self.neighbour_matches, LocalizeOptions().coverage, JudgeOptions()).rejection
         return f"another camera fits, but would be rejected as an answer: {rejection.message}" if rejection else ""
 

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from mapless.geometry import rotation_angle_deg
 from mapless_server.errors import DataLoss, NotFound
+from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.bundle.radii import accuracy_from_covariance, viewpoint_gap
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import PosedView
@@ -20,6 +21,7 @@ from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import prepare, refine
 from mapless_server.method.options import LocalizeOptions, StageContext
 from mapless_server.method.pipeline import Pipeline, reconstruct
+from mapless_server.method.rejection import Rejection
 from mapless_server.security import SceneKey
 from mapless_server.store import SelfCalibration, Store
 from mapless_server.store.calibrations import (
@@ -170,18 +172,18 @@ class Calibrator:
             shared.extend([found] if found else [])
         options = LocalizeOptions(coverage=1.0)
         prepared = prepare(subject.view, references, self._pipeline, options, context, chosen_matches)
-        if isinstance(prepared, Answer):
-            return left_out(subject, prepared)
+        if isinstance(prepared, Rejection):
+            return None
         (coarse,) = reconstruct([prepared])
         if isinstance(coarse, Exception):
             raise coarse
-        return left_out(subject, coarse if isinstance(coarse, Answer) else refine(coarse))
+        return left_out(subject, refine(coarse))
 
 
 def left_out(subject: PosedView, answer: Answer) -> LeftOut | None:
     """Compares the answer to a reference with its pose; None if it was rejected."""
     outcome, support = answer.outcome, answer.support
-    if not isinstance(outcome, Localization) or outcome.covariance is None or support is None:
+    if not isinstance(outcome, Localization) or outcome.covariance is None or not isinstance(support, PosedSupport):
         return None
     found, given = outcome.world_from_camera, subject.world_from_camera
     return LeftOut(

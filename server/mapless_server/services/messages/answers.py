@@ -14,6 +14,7 @@ from mapless.scenes import FACTORS, MAX_FACTOR, MIN_FACTOR, Calibration
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
 from mapless_server.engine.query import Result
+from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.bundle.priors import PriorCheck
 from mapless_server.method.bundle.radii import (
     TAIL_95,
@@ -178,7 +179,7 @@ def outcome_to_message(result: Result, options: LocalizeOptions, frames: AnswerF
         accuracy = accuracy_from_covariance(outcome.covariance)
         conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
         support = result.answer.support
-        gap = viewpoint_gap(support)[0] if support is not None and support.estimate is not None else None
+        gap = viewpoint_gap(support)[0] if isinstance(support, PosedSupport) else None
         radii = reported_radii(accuracy, outcome.covariance, conditions, result.tier.kind, result.attributes, gap)
     return pb.LocalizeResponse(localization=_localization_to_message(outcome, radii, result.attributes, frames))
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, normalize
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.method.bundle.estimate import Support
+from mapless_server.method.bundle.estimate import PosedSupport, Support
 from mapless_server.method.features.views import View
 
 MAX_MATCHES = 2000
@@ -18,9 +18,10 @@ MAX_MATCHES = 2000
 
 def debug_to_message(support: Support) -> pb.Debug:
     """Message of a support's matches; if there are too many, inliers are preferred and sampled evenly."""
-    estimate, matches = support.estimate, support.matches
-    inlier = np.zeros(len(matches), bool) if estimate is None else estimate.inliers
-    error_px = np.full(len(matches), np.nan) if estimate is None else estimate.errors_px
+    matches = support.matches
+    inlier, error_px = np.zeros(len(matches), bool), np.full(len(matches), np.nan)
+    if isinstance(support, PosedSupport):
+        inlier, error_px = support.estimate.inliers, support.estimate.errors_px
     chosen = _chosen(inlier)
     point = matches.point[chosen]
     query_px = sent_pixels(support.query, support.query.features.keypoints[matches.keypoint[chosen]])

@@ -1,0 +1,191 @@
+"""The search for a photograph's pose: what the attempts so far have found, and the attempt that is computed."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from mapless_server.method.attempt import Attempt, Where
+from mapless_server.method.judge.hypothesis import Hypothesis
+from mapless_server.method.ladder import Situation, first_attempt
+from mapless_server.method.options import StageContext, Variant
+from mapless_server.scheduling import Job, StageResult, Step, processor_s
+from mapless_server.store import SceneAttributes
+
+from .query import PREPARE, REFINE, Query, ReferenceSource, Result, Tried
+
+if TYPE_CHECKING:  # services need not load what computes
+    from collections.abc import Sequence
+
+    from mapless_server.method.judge.decide import Verdict
+    from mapless_server.method.judge.hypothesis import Found
+    from mapless_server.method.pipeline import Coarse, Prepared
+
+    from .material import Material
+    from .photos import QueryViews
+    from .query import Tier
+
+_COUNTS = (2, 5, 10, 20, 64)
+"""Queries with about as many references cost about as much."""
+
+SKIPPED = "skipped"
+"""The outcome of an attempt that could not differ from an earlier one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """The state of a query between its stages.
+
+    Attributes:
+        query: the query.
+        source: source of the references.
+        views: the photograph.
+        deadline_s: time after which the answer is useless, by `time.monotonic`.
+        on_better: called in the computing thread with each accepted answer that is better than the ones before, and
+            with a coarse one where the query allows it, while further attempts follow.
+        rung: name of the rung that the attempt is on.
+        attempt: the attempt that is computed.
+        before: the last attempt that had a result; None before the first one.
+        tried: all attempts that have ended.
+        found: their results; those that had none left out.
+        materials: for each result, what it was computed from.
+        attempts: how each attempt ended.
+        verdict: what is answered by now; None before the first result.
+        start_s: when the attempt began, by `time.monotonic`.
+        give_up_s: time after which the verdict so far is the answer, if the attempt has no result by then.
+        listings: how often the scene was listed in the attempt.
+        attributes: attributes of the scene.
+        context: cancels and times the computation from the photograph and references of the attempt.
+        spent_s: time of each stage of the computations before it.
+        processor_s: processor time of the attempt until its present stage.
+        stage_processor_s: the thread's processor time when the present stage began; None between stages.
+        material: the photograph and references; None until they are chosen.
+        prepared: the photographs' matches, for the stage `coarse`.
+        coarse: the reconstruction that attempts of one basis begin with.
+    """
+
+    query: Query
+    source: ReferenceSource
+    views: QueryViews
+    deadline_s: float
+    on_better: Callable[[Result], object] | None = None
+    rung: str = ""
+    attempt: Attempt = field(default_factory=Attempt)
+    before: Attempt | None = None
+    tried: tuple[Attempt, ...] = ()
+    found: tuple[Found, ...] = ()
+    materials: tuple[Material, ...] = ()
+    attempts: tuple[Tried, ...] = ()
+    verdict: Verdict | None = None
+    start_s: float = field(default_factory=time.monotonic)
+    give_up_s: float = math.inf
+    listings: int = 1
+    attributes: SceneAttributes = field(default_factory=SceneAttributes)
+    context: StageContext = field(default_factory=StageContext)
+    spent_s: Mapping[str, float] = field(default_factory=dict)
+    processor_s: float = 0.0
+    stage_processor_s: float | None = None
+    material: Material | None = None
+    prepared: Prepared | None = None
+    coarse: Coarse | None = None
+
+    @classmethod
+    def begin(
+        cls,
+        query: Query,
+        source: ReferenceSource,
+        views: QueryViews,
+        deadline_s: float,
+        on_better: Callable[[Result], object] | None = None,
+    ) -> Search:
+        """The search at its first attempt."""
+        rung, attempt = first_attempt(Situation(can_be_tracked=query.can_be_tracked))
+        return cls(query, source, views, deadline_s, on_better, rung, attempt)
+
+    def situation(self, tiers: Sequence[Tier]) -> Situation:
+        """On which the rungs after the present attempt depend."""
+        query, material, verdict = self.query, self.material, self.verdict
+        can_be_elsewhere = material is not None and material.choice is not None and not query.is_part
+        place = None if verdict is None else verdict.place
+        return Situation(
+            is_best=query.options.variant is Variant.BEST,
+            reference_count=0 if material is None or self.coarse is None else len(material.references),
+            has_priors=bool(query.priors),
+            may_be_elsewhere=can_be_elsewhere and query.narrowing.has_likely,
+            has_place=place is not None and material is not None and len(place.references) < len(material.references),
+            can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),
+            upright_only=tiers[0].upright_only,
+        )
+
+    def ended(self, outcome: str, features: str, has_result: bool = False) -> Search:
+        """The search after the present attempt, which took the time since it began."""
+        seconds = time.monotonic() - self.start_s
+        ended = Tried(self.rung, features, outcome, seconds, self.spent_processor_s)
+        before = self.attempt if has_result else self.before
+        tried = (*self.tried, self.attempt)
+        return replace(self, before=before, tried=tried, attempts=(*self.attempts, ended))
+
+    def to(self, rung: str, attempt: Attempt, give_up_s: float, features: str) -> Search:
+        """The search at another attempt; `features` are those of the one before."""
+        is_other = attempt.basis != self.attempt.basis or self.coarse is None
+        return replace(
+            self,
+            rung=rung,
+            attempt=attempt,
+            give_up_s=give_up_s,
+            start_s=time.monotonic(),
+            processor_s=0.0,
+            stage_processor_s=processor_s(),
+            listings=1,
+            context=StageContext(self.context.check) if is_other else self.context,
+            spent_s=self.seconds(features) if is_other else self.spent_s,
+            coarse=None if is_other else self.coarse,
+        )
+
+    def seconds(self, features: str) -> dict[str, float]:
+        """Time of every stage so far; those of the present photographs after the first ones begin with `features`."""
+        is_first = not any(it.basis != self.attempt.basis for it in self.tried if it.where is not Where.NEAR_PRIOR)
+        seconds = dict(self.spent_s)
+        for name, spent_s in self.context.stage_seconds.items():
+            name = name if is_first else f"{features}/{name}"
+            seconds[name] = seconds.get(name, 0.0) + spent_s
+        return seconds
+
+    @property
+    def spent_processor_s(self) -> float:
+        """Processor time of the attempt so far."""
+        begun_s = self.stage_processor_s
+        return self.processor_s + (0.0 if begun_s is None else processor_s() - begun_s)
+
+    @property
+    def best(self) -> Attempt | None:
+        """The attempt of the best pose so far."""
+        chosen = None if self.verdict is None else self.verdict.chosen
+        return chosen.attempt if isinstance(chosen, Hypothesis) else None
+
+    @property
+    def kind(self) -> str:
+        """Kind of its jobs; jobs of one kind take about the same time."""
+        count = len(self.query.reference_ids)
+        size = next((it for it in _COUNTS if count <= it), _COUNTS[-1])
+        return f"{self.rung}, tier {self.attempt.features}, {'chosen' if self.query.chooses else f'up to {size}'}"
+
+    @property
+    def first_step(self) -> Step[Search]:
+        """The first step of the attempt: what the attempts before have computed is not computed again."""
+        material, attempt = self.material, self.attempt
+        is_ready = self.coarse is not None and material is not None and material.serves(attempt)
+        return self.step(REFINE if is_ready else PREPARE)
+
+    def step(self, stage: str, bucket: str = "") -> Step[Search]:
+        """A step of the attempt."""
+        return Step(stage, self.kind, bucket or self.kind, self)
+
+
+SearchStep = Step[Search]
+SearchJob = Job[Search, Result]
+SearchResult = StageResult[Search, Result]
+"""The queue's types with a query's payload and value."""

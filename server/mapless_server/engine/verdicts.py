@@ -1,0 +1,120 @@
+"""From what attempts have found to the result for the caller: options and limits of the scene, hints, times."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from mapless_server.method import ladder
+from mapless_server.method.attempt import Attempt, Where
+from mapless_server.method.bundle.estimate import PosedSupport
+from mapless_server.method.judge.answer import Localization
+from mapless_server.method.judge.hints import hinted
+from mapless_server.method.judge.hypothesis import Doubt, Found
+from mapless_server.method.judge.judge import trust_in_scene
+from mapless_server.method.judge.references import supporters_of, with_contradiction, without_agreement
+from mapless_server.method.options import DoubtOptions
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.scenes import ANYWHERE
+from mapless_server.store import SceneAttributes
+
+from . import tracking
+from .material import Material
+from .query import Result, Tier
+from .search import Search
+
+
+class Verdicts:
+    """Makes results of what attempts with these tiers have found."""
+
+    def __init__(self, tiers: Sequence[Tier], doubt: DoubtOptions) -> None:
+        self._tiers = tiers
+        self._doubt = doubt
+
+    def tier(self, attempt: Attempt) -> Tier:
+        """The features and backend of an attempt."""
+        tier = self._tiers[attempt.features]
+        return tracking.tracking_tier(tier) if attempt.where is Where.NEAR_PRIOR else tier
+
+    def doubt_in(self, search: Search) -> DoubtOptions:
+        """Adapts the options to the scene's quantiles of trust, so that the same answers are doubtful in all scenes."""
+        calibration = search.attributes.self_calibration(self._tiers[search.attempt.features].kind)
+        if calibration is None:
+            return self._doubt
+        return replace(self._doubt, trust=trust_in_scene(self._doubt.trust, calibration.trust_quantiles))
+
+    def pipeline(self, search: Search, tier: Tier) -> Pipeline:
+        """The pipeline of a tier, with the trust of the search's scene."""
+        calibration = search.attributes.self_calibration(tier.kind)
+        return tier.pipeline.with_trust(calibration.trust_quantiles if calibration else ())
+
+    def within_limits(self, search: Search, found: Found) -> Found:
+        """The result, rejected if its pose is beyond hard limits, or its references contradict one another."""
+        outcome, narrowing = found.answer.outcome, search.query.narrowing
+        if not isinstance(outcome, Localization):
+            return found
+        if narrowing is not ANYWHERE:
+            beyond = narrowing.contradiction(outcome.world_from_camera, search.attributes.unit)
+            if beyond:
+                rejection = Rejection(RejectionReason.PRIOR_CONFLICT, beyond)
+                return _rejected(found, rejection, Doubt.BEYOND_LIMITS)
+        if search.attributes.contradiction and isinstance(found.answer.support, PosedSupport):
+            disagreement = without_agreement([supporters_of(found.answer.support)])
+            if disagreement:
+                return _rejected(found, disagreement, Doubt.CHANCE)
+        return found
+
+    def answer(self, search: Search) -> Result:
+        """The result for the caller by the verdict."""
+        verdict = search.verdict
+        assert verdict is not None
+        chosen = verdict.chosen
+        result = self.result(search, chosen, search.materials[search.found.index(chosen)], verdict.outcome)
+        ended = zip(search.attempts, search.tried, strict=True)
+        return replace(result, attempts=tuple(replace(it, is_chosen=tried == chosen.attempt) for it, tried in ended))
+
+    def without_present(self, search: Search, outcome: str) -> Result:
+        """The result without the present attempt, which ended so."""
+        assert search.verdict is not None
+        search = search.ended(outcome, self.tier(search.attempt).features)
+        answered = self.answer(search)
+        rejection = answered.answer.outcome
+        if isinstance(rejection, Rejection) and rejection.hint is not None:
+            # Without this, the hint would tell the caller to move although repeating the call may succeed.
+            untried = next((it.untried for it in ladder.RUNGS if it.name == search.rung), "as it is")
+            advice = f"Trying it {untried} was not finished: asking again, when less is asked, may help."
+            hint = replace(rejection.hint, message=f"{rejection.hint.message} {advice}")
+            answered = replace(answered, answer=replace(answered.answer, outcome=replace(rejection, hint=hint)))
+        return answered
+
+    def result(self, search: Search, found: Found, material: Material, outcome: Localization | Rejection) -> Result:
+        """The result of an attempt with an outcome, whose hint says what would help."""
+        answer, contradiction = replace(found.answer, outcome=outcome), search.attributes.contradiction
+        if isinstance(outcome, Rejection):
+            has_prior = material.is_searched and not search.query.narrowing.is_empty
+            answer = hinted(answer, material.view, material.references, has_prior)
+            assert isinstance(answer.outcome, Rejection)
+            answer = replace(answer, outcome=with_contradiction(answer.outcome, contradiction))
+        return Result(
+            answer,
+            self.tier(found.attempt),
+            material.references,
+            material.generation,
+            material.view.camera,
+            material.choice,
+            search.attributes,
+            search.seconds(self.tier(search.attempt).features),
+        )
+
+
+def _rejected(found: Found, rejection: Rejection, doubts: Doubt) -> Found:
+    return replace(found, answer=replace(found.answer, outcome=rejection), doubts=doubts)
+
+
+def attributes_of(search: Search) -> SceneAttributes:
+    """The attributes of the search's scene, as far as they count for its query."""
+    attributes = search.source.attributes(search.query.scene_key)
+    if search.query.is_generic:
+        attributes = replace(attributes, calibration=None, self_calibrations=())
+    if attributes.contradiction:  # radii and trust measured by its references say nothing
+        attributes = replace(attributes, self_calibrations=())
+    return attributes

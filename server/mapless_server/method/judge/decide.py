@@ -1,0 +1,281 @@
+"""Decides which of all results of a photograph's attempts is its answer: one rule for all of them.
+
+All poses that were found, accepted or not, are scored on the same matches (`pose.relative.score`): all that the
+strongest features tried have with any reference, each reference's once. Poses near one another are one place, whose
+score is that of its best pose. The place with the best score is answered, by its accepted pose with the best score or
+by what was found wrong with its poses, if it has 1.5 times the score of any other. Otherwise priors decide if they
+exclude all places but one; if they do not, the photograph is ambiguous. PoseLib's RANSAC loop does the same with
+samples: generate models, score all of them on the same data, keep the best.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import and_, or_
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+
+from ..attempt import Raster
+from ..bundle.estimate import Support
+from ..bundle.priors import Priors
+from ..bundle.radii import accuracy_from_covariance
+from ..pose import relative
+from ..pose.relative import RelativePoseOptions
+from ..pose.two_view_matches import TwoViewMatches
+from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
+from .answer import Localization
+from .evidence import Votes, votes_of
+from .hypothesis import Doubt, Failed, Found, Hypothesis
+
+SAME_POSITION_M, SAME_ROTATION_DEG = 0.1, 2.0
+"""Poses closer than this are one place. Radii do not include errors of the references' poses, so they can be too small
+for this test."""
+
+SAME_SHARE = 0.05
+"""Poses closer than this share of the distance to what the photograph shows are one place: so far off a right pose may
+be."""
+
+CLEARLY_MORE = 1.5
+"""A place is clearly better than another if its score is this many times as large."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What is answered after the attempts so far.
+
+    Attributes:
+        chosen: the attempt's result that is answered, or whose data go with a rejection.
+        outcome: the pose, or why there is none.
+        doubts: why another attempt could change it.
+        place: the place that the priors decide for, if the chosen attempt alone cannot tell it from another.
+    """
+
+    chosen: Found
+    outcome: Localization | Rejection
+    doubts: Doubt
+    place: PoseHypothesis | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Poses that are near one another, the best score first."""
+
+    poses: Sequence[Hypothesis]
+    score: float
+
+    @property
+    def accepted(self) -> Sequence[Hypothesis]:
+        return [it for it in self.poses if it.is_accepted]
+
+    @property
+    def stands_alone(self) -> bool:
+        """Whether it has an accepted pose to which the photograph alone leads."""
+        return any(Doubt.ON_PRIOR_ALONE not in it.doubts for it in self.accepted)
+
+    def as_hypothesis(self) -> PoseHypothesis:
+        best = next(iter(self.accepted), self.poses[0])
+        support = best.answer.support
+        counts = [] if support is None else list(zip(support.references, support.inliers_by_reference(), strict=True))
+        names = tuple(reference.name for reference, count in counts if count)
+        return PoseHypothesis(best.world_from_camera, best.inlier_count, names)
+
+
+def decide(found: Sequence[Found], priors: Priors, unit: str = "m") -> Verdict:
+    """Returns the verdict after at least one attempt.
+
+    Args:
+        found: the attempts' results, in order; poses beyond the caller's limits are rejections that say so.
+        priors: the photograph's priors, in the caller's world.
+        unit: of the scene's lengths, in messages.
+    """
+    failed = [it for it in found if isinstance(it, Failed)]
+    if wrong := [it for it in failed if Doubt.CAMERA in it.doubts]:  # mirrored
+        return Verdict(wrong[0], wrong[0].answer.outcome, Doubt.CAMERA)
+    within = [it for it in found if isinstance(it, Hypothesis) and Doubt.BEYOND_LIMITS not in it.doubts]
+    if not any(it.is_accepted for it in within):
+        return _rejected(found, priors)
+    rivals = _rivals(_places_of(within, found), priors)
+    if len(rivals) == 1:
+        return _at(rivals[0])
+    decided = place_of_priors([it.as_hypothesis() for it in rivals], [it.score for it in rivals], priors)
+    return _at(rivals[decided]) if isinstance(decided, int) else _ambiguous(rivals, decided, unit)
+
+
+def at_one_place(first: Hypothesis, second: Hypothesis) -> bool:
+    """Whether two poses are of one place: no further apart than both may be off."""
+    radii = [accuracy_from_covariance(it.covariance) for it in (first, second)]
+    share_m = SAME_SHARE * min(first.distance_m, second.distance_m)
+    reach_m = max(SAME_POSITION_M, share_m, sum(it.position_95_m for it in radii))
+    reach_deg = max(SAME_ROTATION_DEG, sum(it.rotation_95_deg for it in radii))
+    apart_m, apart_deg = _apart(first.world_from_camera, second.world_from_camera)
+    return apart_m <= reach_m and apart_deg <= reach_deg
+
+
+def place_of_priors(places: Sequence[PoseHypothesis], scores: Sequence[float], priors: Priors) -> int | Hint | None:
+    """Index of the only place that the priors do not exclude, or a hint why they do not decide; None without priors.
+
+    They decide if all of them agree with one place and exclude the others, unless another has clearly more.
+    """
+    if not priors:
+        return None
+    # Hypotheses are not refined. Their assumed error is such that two of one place still agree at two sigma.
+    sigmas = [SAME_POSITION_M / 2] * 3 + [math.radians(SAME_ROTATION_DEG) / 2] * 3
+    covariance = np.diag(np.square(sigmas))
+    checks = [priors.check(it.world_from_camera, covariance) for it in places]
+    left = [i for i, of_one in enumerate(checks) if not any(it.conflict for it in of_one)]
+    best = next(iter(places[0].references), None)
+    if not left:
+        return Hint("judge", Advice.CHECK_PRIOR, "Check the prior: it fits neither of the two places.", best)
+    if len(left) > 1:
+        message = (
+            "Take a photograph that shows where the two places differ, or give a prior with smaller standard "
+            "deviations: the one given fits both; if there is one place only, check the references' poses."
+        )
+        return Hint("judge", Advice.TELL_PLACES_APART, message, best)
+    if not all(it.is_likely for it in checks[left[0]]):
+        return Hint("judge", Advice.CHECK_PRIOR, "Check the prior: it fits neither of the two places well.", best)
+    if max(scores) >= CLEARLY_MORE * scores[left[0]]:
+        message = "Check the prior: the photograph shows more of the other place."
+        return Hint("judge", Advice.CHECK_PRIOR, message, best)
+    return left[0]
+
+
+def _places_of(hypotheses: Sequence[Hypothesis], found: Sequence[Found]) -> list[_Place]:
+    """The places of the poses, the best score first."""
+    scores = _scores(hypotheses, found)
+    order = sorted(range(len(hypotheses)), key=lambda i: (-scores[i], -hypotheses[i].attempt.features))
+    places: list[tuple[float, list[Hypothesis]]] = []
+    for i in order:
+        pose = hypotheses[i]
+        near = next((poses for _, poses in places if at_one_place(poses[0], pose)), None)
+        if near is None:
+            places.append((scores[i], [pose]))
+        else:
+            near.append(pose)
+    return [_Place(poses, score) for score, poses in places]
+
+
+def _rivals(places: Sequence[_Place], priors: Priors) -> list[_Place]:
+    """The places between which scores do not decide, the best first.
+
+    A place that contradicts the priors is never answered where an accepted pose agrees with them, and does not rest on
+    them.
+    """
+    best = places[0]
+    rivals = [it for it in places if CLEARLY_MORE * it.score > best.score or it is best]
+    if len(rivals) == 1 and priors and _conflicts(best, priors):
+        rivals += [it for it in places[1:] if it.stands_alone and not _conflicts(it, priors)][:1]
+    return rivals
+
+
+def _conflicts(place: _Place, priors: Priors) -> bool:
+    pose = next(iter(place.accepted), place.poses[0])
+    return any(it.conflict for it in priors.check(pose.world_from_camera, pose.covariance))
+
+
+def _scores(hypotheses: Sequence[Hypothesis], found: Sequence[Found]) -> list[float]:
+    """The scores of the poses on the same matches; their numbers of inliers, if no matches are known."""
+    if len(hypotheses) == 1:
+        return [0.0]
+    matches = list(_matches(found))
+    if not matches:
+        return [float(it.inlier_count) for it in hypotheses]
+    return [sum(it.score(pose.world_from_camera) for it in matches) for pose in hypotheses]
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """Matches of a photograph with some references: as lines, and where they lead to a point, as points.
+
+    The points are those before the vote for a keypoint's point, which removes those of a weaker place; of a keypoint's
+    points the best one counts. `origin` (3,) is that of their world.
+    """
+
+    lines: relative.Evidence
+    votes: Votes
+    origin: Array
+
+    @classmethod
+    def of(cls, support: Support, is_used: NDArray[np.bool_]) -> "_Scored":
+        """The matches of a support with these of its references (K,)."""
+        lines = TwoViewMatches.of(support.query, support.references, support.query_matches)
+        votes, none = votes_of(support, support.query_matches), np.empty(0, np.intp)
+        used = lines[is_used[lines.reference]]
+        evidence = relative.Evidence(support.query, support.references, used, np.empty((0, 3)), none)
+        return cls(evidence, votes[is_used[votes.reference]], support.origin)
+
+    def score(self, world_from_camera: RigidTransform) -> float:
+        """The score of a pose in the caller's world, see `pose.relative`."""
+        pose, options = world_from_camera.shifted(-self.origin), RelativePoseOptions()
+        errors = np.nan_to_num(self.votes.seen.errors_px(pose) / options.pnp.inlier_px, nan=np.inf)
+        best = np.zeros(len(self.lines.query.features))
+        np.maximum.at(best, self.votes.keypoint, np.clip(1 - errors**2, 0, None))
+        disc = relative.disc_chance(self.lines.query.camera, options.pnp.inlier_px)
+        return relative.score(self.lines, pose, options) - float(np.log10(disc) * best.sum())
+
+
+def _matches(found: Sequence[Found]) -> Iterator[_Scored]:
+    """All matches of the strongest features that have any, each reference's once.
+
+    Features of the photograph turned are others than of it as it is.
+    """
+    supports = [(it.attempt, it.answer.support) for it in found if it.answer.support is not None]
+    strongest = max((attempt.features for attempt, _ in supports), default=0)
+    seen: set[tuple[Raster, float, str]] = set()
+    for attempt, support in reversed(supports):
+        keys = [(attempt.raster, attempt.angle_deg, it.key) for it in support.references]
+        is_new = np.array([key not in seen for key in keys])
+        if attempt.features == strongest and is_new.any():
+            seen.update(keys)
+            yield _Scored.of(support, is_new)
+
+
+def _at(place: _Place) -> Verdict:
+    """The verdict for one place."""
+    accepted = place.accepted
+    chosen, counted = (accepted[0], accepted) if accepted else (place.poses[0], place.poses)
+    return Verdict(chosen, chosen.answer.outcome, reduce(and_, (it.doubts for it in counted)))
+
+
+def _rejected(found: Sequence[Found], priors: Priors) -> Verdict:
+    """The rejection that says most, with all doubts: the strongest features' first, unless one names a cause."""
+
+    def says(result: Found) -> tuple[bool, int, bool]:
+        outcome = result.answer.outcome
+        assert isinstance(outcome, Rejection)
+        names_two = bool(outcome.hypotheses) or Doubt.CAMERA in result.doubts
+        return names_two, result.attempt.features, outcome.hint is not None
+
+    chosen = max(found, key=says)
+    outcome, doubts = chosen.answer.outcome, reduce(or_, (it.doubts for it in found))
+    assert isinstance(outcome, Rejection)
+    verdict = Verdict(chosen, outcome, Doubt.CAMERA if Doubt.CAMERA in chosen.doubts else doubts)
+    if len(outcome.hypotheses) != 2 or outcome.hint is not None:
+        return verdict
+    counts = [float(it.inlier_count) for it in outcome.hypotheses]
+    decided = place_of_priors(outcome.hypotheses, counts, priors)
+    if isinstance(decided, Hint):
+        return replace(verdict, outcome=replace(outcome, hint=decided))
+    return verdict if decided is None else replace(verdict, place=outcome.hypotheses[decided])
+
+
+def _ambiguous(rivals: Sequence[_Place], hint: Hint | None, unit: str) -> Verdict:
+    first, second = (it.as_hypothesis() for it in rivals[:2])
+    apart_m, apart_deg = _apart(first.world_from_camera, second.world_from_camera)
+    message = (
+        f"two poses {apart_m:.2f} {unit} and {apart_deg:.0f} degrees apart explain the photograph, found by different "
+        f"attempts: one with {first.inlier_count} inliers, the other with {second.inlier_count}"
+    )
+    rejection = Rejection(RejectionReason.AMBIGUOUS, message, hint, hypotheses=(first, second))
+    chosen = next(iter(rivals[0].accepted), rivals[0].poses[0])
+    return Verdict(chosen, rejection, Doubt.TWO_PLACES)
+
+
+def _apart(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:
+    """Distance of two poses, metres, and the angle between them, degrees."""
+    apart_m = float(np.linalg.norm(first.translation - second.translation))
+    return apart_m, rotation_angle_deg(first.rotation.T @ second.rotation)

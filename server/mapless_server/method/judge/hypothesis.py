@@ -1,0 +1,121 @@
+"""The result of an attempt: a hypothesis, which has a pose, or a failure without one; and the doubts that it leaves."""
+
+from dataclasses import dataclass
+from enum import Flag, auto
+
+import numpy as np
+
+from mapless.geometry import Array, RigidTransform
+
+from ..attempt import Attempt
+from ..bundle.estimate import PosedSupport
+from ..bundle.radii import accuracy_from_covariance
+from ..options import DoubtOptions
+from ..rejection import Rejection, RejectionReason
+from .answer import Answer, Localization
+
+
+class Doubt(Flag):
+    """Why a further attempt could give a better answer, or why none can."""
+
+    NONE = 0
+    STARVED = auto()
+    """Too few matches for a pose."""
+    CHANCE = auto()
+    """The evidence for the pose does not suffice."""
+    TWO_PLACES = auto()
+    BEYOND_LIMITS = auto()
+    """The pose is where the caller says that the camera is not."""
+    LOW_TRUST = auto()
+    WIDE_RADIUS = auto()
+    FEW_INLIERS = auto()
+    ON_PRIOR_ALONE = auto()
+    """The photograph alone gives no initial pose."""
+    LIKE_ELSEWHERE = auto()
+    """References elsewhere share much with the photograph that does not fit the pose."""
+    CAMERA = auto()
+    """The photograph contradicts its camera: no other attempt changes that."""
+    REFERENCES = auto()
+    """There are no references, or they were taken from one place: no other features change that."""
+
+
+_OF_REASON = {
+    RejectionReason.NO_USABLE_REFERENCES: Doubt.STARVED,
+    RejectionReason.DEGENERATE_REFERENCES: Doubt.REFERENCES,
+    RejectionReason.GATE: Doubt.CHANCE,
+    RejectionReason.AMBIGUOUS: Doubt.TWO_PLACES,
+    RejectionReason.PRIOR_CONFLICT: Doubt.BEYOND_LIMITS,
+}
+"""Doubts that rejections leave; those for other reasons leave `STARVED`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """A pose that an attempt found, accepted or not.
+
+    Attributes:
+        attempt: how it was found.
+        answer: its outcome is the accepted pose, or the rejection that says why it is not.
+        doubts: what it leaves in doubt.
+        world_from_camera: the pose in the caller's world, metric.
+        covariance: (6, 6) as of `Localization`, without what halves of the data that disagree add to it; zeros for a
+            pose that nothing has checked.
+        distance_m: median distance of what supports it; 0 if that is unknown.
+        inlier_count: number of inliers.
+    """
+
+    attempt: Attempt
+    answer: Answer
+    doubts: Doubt
+    world_from_camera: RigidTransform
+    covariance: Array
+    distance_m: float
+    inlier_count: int
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether the attempt's judge accepted it."""
+        return isinstance(self.answer.outcome, Localization)
+
+
+@dataclass(frozen=True, eq=False)
+class Failed:
+    """An attempt that found no pose; the outcome of its answer is a rejection."""
+
+    attempt: Attempt
+    answer: Answer
+    doubts: Doubt
+
+
+Found = Hypothesis | Failed
+
+
+def found_by(attempt: Attempt, answer: Answer, options: DoubtOptions, doubts: Doubt = Doubt.NONE) -> Found:
+    """Makes the result of an attempt from its answer; `doubts` are left beside those that the answer says."""
+    doubts |= doubts_of(answer, options)
+    outcome, support = answer.outcome, answer.support
+    if isinstance(support, PosedSupport):
+        pose, covariance = support.estimate.world_from_camera.shifted(support.origin), support.estimate.covariance
+        return Hypothesis(attempt, answer, doubts, pose, covariance, support.distance_m(), support.inlier_count())
+    if isinstance(outcome, Localization):
+        covariance = np.zeros((6, 6)) if outcome.covariance is None else outcome.covariance
+        return Hypothesis(attempt, answer, doubts, outcome.world_from_camera, covariance, 0.0, outcome.inlier_count)
+    return Failed(attempt, answer, doubts)
+
+
+def doubts_of(answer: Answer, options: DoubtOptions) -> Doubt:
+    """The doubts that an answer leaves; none for a pose that nothing has checked (`Variant.COARSE`)."""
+    outcome = answer.outcome
+    if isinstance(outcome, Rejection):
+        return doubt_of(outcome)
+    if outcome.covariance is None or outcome.trust is None:
+        return Doubt.NONE
+    is_wide = not accuracy_from_covariance(outcome.covariance).position_68_m <= options.radius_m
+    doubts = Doubt.LOW_TRUST if outcome.trust < options.trust else Doubt.NONE
+    doubts |= Doubt.WIDE_RADIUS if is_wide else Doubt.NONE
+    return doubts | (Doubt.FEW_INLIERS if outcome.inlier_count < options.inliers else Doubt.NONE)
+
+
+def doubt_of(rejection: Rejection) -> Doubt:
+    """The doubt that a rejection leaves."""
+    return Doubt.CAMERA if rejection.intrinsics_checks else _OF_REASON.get(rejection.reason, Doubt.STARVED)

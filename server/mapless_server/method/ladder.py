@@ -1,0 +1,191 @@
+"""The ladder: which attempt follows another, and for which doubts, as a table.
+
+A rung changes the attempt before it. The rungs are tried in the order of the table, the first one first that changes it
+to an attempt that was not tried yet; so after stronger features, or other references, those above them are tried again.
+"""
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+
+from .attempt import Attempt, Raster, Solver, Where
+from .judge.hypothesis import Doubt
+from .pairs.pair import Matching
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a photograph, its request and the server have, on which rungs depend.
+
+    Attributes:
+        is_best: whether the variant of the method is the best one; the paper's has one attempt.
+        reference_count: number of references that the attempt before was reconstructed with.
+        has_priors: whether there are priors.
+        can_be_tracked: whether a pose prior says which references are near.
+        may_be_elsewhere: whether references elsewhere would be chosen without soft priors.
+        has_place: whether the priors exclude one of two places that explain the photograph.
+        can_match_strongly: for each features, whether a network can match them.
+        upright_only: whether the first features match nothing in a photograph that is turned.
+    """
+
+    is_best: bool = True
+    reference_count: int = 2
+    has_priors: bool = False
+    can_be_tracked: bool = False
+    may_be_elsewhere: bool = False
+    has_place: bool = False
+    can_match_strongly: tuple[bool, ...] = (False,)
+    upright_only: bool = False
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A way to change an attempt.
+
+    Attributes:
+        name: in diagnostics and metrics.
+        changes: what it changes, in words.
+        doubts: it is tried on any of these.
+        needs: what it needs, in words.
+        cost: what it computes again.
+        untried: says in a rejection that it was not finished.
+        change: makes the attempt from the one before, and the one of the best pose so far; None for none.
+        is_possible: whether an attempt can be changed so.
+    """
+
+    name: str
+    changes: str
+    doubts: Doubt
+    needs: str
+    cost: str
+    untried: str
+    change: Callable[[Attempt, Attempt | None], Attempt]
+    is_possible: Callable[[Attempt, Situation], bool]
+
+
+STRENGTHENED = (
+    Doubt.STARVED | Doubt.CHANCE | Doubt.TWO_PLACES | Doubt.BEYOND_LIMITS | Doubt.LOW_TRUST | Doubt.WIDE_RADIUS
+)
+"""Doubts that better matches can remove."""
+
+TRACKED, AS_IT_IS = "tracked", "as it is"
+
+
+def _stronger(before: Attempt, best: Attempt | None) -> Attempt:
+    raster = (Raster.AS_IS, 0.0) if best is None else (best.raster, best.angle_deg)
+    return Attempt(before.features + 1, *raster, Where.LIKELY if before.where is Where.ONE_PLACE else before.where)
+
+
+def _on_points(attempt: Attempt, situation: Situation) -> bool:
+    return situation.is_best and situation.reference_count >= 2
+
+
+RUNGS = (
+    Rung(
+        "rematched",
+        "the photograph is matched by a network",
+        STRENGTHENED,
+        "a network that matches these features",
+        "matches with each reference, a step of the queue each; structure and pose",
+        "with matches of a network",
+        lambda before, _: before.basis.but(matching=Matching.STRONG),
+        lambda before, it: it.can_match_strongly[before.features] and before.raster is Raster.AS_IS,
+    ),
+    Rung(
+        "wide",
+        "matches of references also where a third one is needed to confirm them",
+        Doubt.STARVED | Doubt.CHANCE | Doubt.FEW_INLIERS,
+        "two references",
+        "matches of pairs of references, which are stored; structure and pose",
+        "with wide matches",
+        lambda before, _: before.but(matching=before.matching.widened, solver=Solver.POINTS),
+        _on_points,
+    ),
+    Rung(
+        "without priors",
+        "priors take no part in the pose",
+        Doubt.STARVED | Doubt.CHANCE | Doubt.BEYOND_LIMITS | Doubt.ON_PRIOR_ALONE,
+        "priors",
+        "structure and pose",
+        "without priors",
+        lambda before, _: before.but(matching=before.matching.narrow, solver=Solver.POINTS, uses_priors=False),
+        lambda before, it: it.has_priors and _on_points(before, it),
+    ),
+    Rung(
+        "lines",
+        "the pose is found from matches with single references, too",
+        Doubt.STARVED,
+        "two references",
+        "a pose from epipolar lines",
+        "from epipolar lines",
+        lambda before, _: before.but(matching=before.matching.widened, solver=Solver.LINES),
+        _on_points,
+    ),
+    Rung(
+        "one place",
+        "references of one of two places",
+        Doubt.TWO_PLACES,
+        "priors that exclude the other place",
+        "structure and pose",
+        "with references of one of the places",
+        lambda before, _: before.basis.but(where=Where.ONE_PLACE),
+        lambda before, it: it.has_place,
+    ),
+    Rung(
+        "elsewhere",
+        "references anywhere in the scene",
+        Doubt.STARVED | Doubt.CHANCE | Doubt.TWO_PLACES | Doubt.BEYOND_LIMITS | Doubt.REFERENCES | Doubt.LIKE_ELSEWHERE,
+        "soft priors that keep references out that resemble the photograph",
+        "matches with other references, structure and pose",
+        "with references of the whole scene",
+        lambda before, _: before.basis.but(where=Where.ANYWHERE),
+        lambda before, it: it.may_be_elsewhere,
+    ),
+    Rung(
+        "turned",
+        "features of the photograph turned as it matches most",
+        Doubt.STARVED | Doubt.CHANCE | Doubt.LOW_TRUST,
+        "first features that match only what is upright; clearly more matches turned",
+        "features four times, and all that follows",
+        "turned by 90, 180 and 270 degrees",
+        lambda before, _: before.basis.but(raster=Raster.TURNED),
+        lambda before, it: it.upright_only and before.features == 0 and before.raster is Raster.AS_IS,
+    ),
+    Rung(
+        "stronger",
+        "the next stronger features",
+        STRENGTHENED,
+        "further features",
+        "everything",
+        "with stronger features",
+        _stronger,
+        lambda before, it: before.features + 1 < len(it.can_match_strongly),
+    ),
+)
+"""The rungs in the order in which they are tried, after the first attempt: near a pose prior, or as it is."""
+
+
+def first_attempt(situation: Situation) -> tuple[str, Attempt]:
+    """The rung's name and the attempt that begins."""
+    if situation.can_be_tracked:
+        return TRACKED, Attempt(raster=Raster.REDUCED, where=Where.NEAR_PRIOR)
+    return AS_IT_IS, Attempt()
+
+
+def further(
+    before: Attempt, best: Attempt | None, tried: Collection[Attempt], doubts: Doubt, situation: Situation
+) -> Iterator[tuple[Rung, Attempt]]:
+    """The attempts that can remove one of the doubts, in order.
+
+    Args:
+        before: the last attempt.
+        best: that of the best pose so far; None if none has a pose.
+        tried: all attempts so far.
+        doubts: what they leave in doubt.
+        situation: on which rungs are possible.
+    """
+    if Doubt.CAMERA in doubts:
+        return
+    for rung in RUNGS:
+        attempt = rung.change(before, best)
+        if rung.doubts & doubts and rung.is_possible(before, situation) and attempt not in tried:
+            yield rung, attempt

@@ -1,0 +1,202 @@
+"""One attempt at a pose: scale > structure > match > pnp > gate > adjust > covariance > judge.
+
+Where one reference is given the points are those of a network's depths; `Solver.LINES` needs no points at all.
+"""
+
+from dataclasses import replace
+
+from .attempt import Attempt, Solver
+from .bundle.adjust import adjust_pose, with_covariance
+from .bundle.estimate import PosedSupport, Support
+from .bundle.priors import NO_PRIORS
+from .bundle.radii import with_halves
+from .coarse import Triangulation
+from .features.views import Reconstruction
+from .judge.answer import Answer, Localization
+from .judge.evidence import votes_of
+from .judge.fixed import unmoved_failure
+from .judge.hypothesis import Doubt, Found, found_by
+from .judge.intrinsics import intrinsics_checks
+from .judge.judge import contradiction, judge
+from .judge.one_reference import one_reference_failure, trust_of_score
+from .judge.two_view import (
+    lacks_distance,
+    one_reference_rejection,
+    two_view_evidence,
+    two_view_failure,
+    two_view_trust,
+    without_unmoved,
+)
+from .options import DoubtOptions, Variant
+from .pairs.pair import Matching
+from .pipeline import Coarse, structure_and_matches, unverified, with_wide_correspondences
+from .pose.one_reference import solve_one_reference
+from .pose.pnp import gate_failure, solve_pose
+from .pose.two_view import solve_two_view
+from .rejection import Rejection, RejectionReason
+from .structure.model import MetricScale, ScaleStage
+
+
+def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
+    """Computes an attempt's pose from its photographs, matched strictly and reconstructed together.
+
+    Args:
+        coarse: the reconstruction of the attempt's basis, with priors if there are any.
+        attempt: what to change in it.
+        doubt: when the pose is doubtful.
+    """
+    if attempt.solver is Solver.LINES:
+        return found_by(attempt, _from_lines(coarse), doubt)
+    made = coarse if attempt.uses_priors else _without_priors(coarse)
+    made = with_wide_correspondences(made) if attempt.matching.is_wide else made
+    answer = _from_points(made)
+    if not attempt.uses_priors:
+        answer = _compared(answer, coarse)
+    found = found_by(attempt, answer, doubt)
+    rests_on_priors = isinstance(made.reconstruction, Triangulation) and made.reconstruction.without_priors is not None
+    if rests_on_priors and Doubt.FEW_INLIERS in found.doubts:
+        return replace(found, doubts=found.doubts | Doubt.ON_PRIOR_ALONE)
+    return found
+
+
+def _without_priors(coarse: Coarse) -> Coarse:
+    """What the coarse stage gives without priors."""
+    free = replace(coarse, prepared=replace(coarse.prepared, priors=NO_PRIORS))
+    if isinstance(coarse.reconstruction, Triangulation) and (alone := coarse.reconstruction.without_priors):
+        return replace(free, reconstruction=alone, scale=alone)
+    return free
+
+
+def _compared(answer: Answer, coarse: Coarse) -> Answer:
+    """Compares a pose that was computed without the priors with them."""
+    outcome, prepared = answer.outcome, coarse.prepared
+    if isinstance(outcome, Rejection) or outcome.covariance is None:
+        return answer
+    checks = prepared.priors.shifted(prepared.origin).check(outcome.world_from_camera, outcome.covariance)
+    return replace(answer, outcome=replace(outcome, prior_checks=tuple(replace(it, used=False) for it in checks)))
+
+
+def _from_points(coarse: Coarse) -> Answer:
+    """The pose from 2D-3D matches.
+
+    If the evidence does not suffice, the pose's agreement with gravity and heading counts as evidence, too.
+    """
+    prepared, scale, stage = coarse.prepared, coarse.scale, coarse.prepared.context.stage
+    if isinstance(scale, Rejection):
+        return coarse.answer(scale)
+    if prepared.options.variant is Variant.COARSE:
+        return coarse.answer(unverified(scale))
+    if scale.stage is ScaleStage.NETWORK:
+        return _from_one_reference(coarse, scale)
+    query, references, options, priors = prepared.query, prepared.references, prepared.pipeline.options, prepared.priors
+    structure, matches = structure_and_matches(coarse, scale)
+    query_matches = tuple(prepared.correspondences.query_matches)
+    sigma = prepared.options.intrinsics
+    error_px = prepared.correspondences.reference_error_px
+    support = Support(query, references, structure, matches, prepared.origin, query_matches, sigma, error_px)
+    with stage("pnp"):
+        estimate = solve_pose(query, structure, matches, scale.world_from_query, options.pnp, priors)
+    if isinstance(estimate, Rejection):
+        return coarse.answer(estimate, support)
+    posed = support.posed(estimate)
+    agreement = priors.log10_chance(estimate.world_from_camera) if priors.has_directions else 0.0
+    failure, chance = _gated(posed, coarse, 0.0), 0.0
+    if failure and agreement:
+        failure, chance = _gated(posed, coarse, agreement), agreement
+    if failure:
+        return coarse.answer(Rejection(RejectionReason.GATE, failure), posed)
+    if prepared.options.variant is Variant.BEST:
+        with stage("adjust"):
+            given = query, references, structure, matches, estimate, options.adjust, priors, sigma
+            estimate = adjust_pose(*given, query_matches)
+    posed = support.posed(estimate)
+    with stage("uncertainty"):
+        predicted = not prepared.structure_options.optimize
+        estimate = with_covariance(posed, scale, options.adjust, priors, predicted, sigma)
+    return _judged(replace(posed, estimate=estimate), coarse, chance, agreement)
+
+
+def _gated(support: PosedSupport, coarse: Coarse, log10_chance: float) -> str | None:
+    """Says why chance, or what is fixed to the camera, could give the pose; None if they could not."""
+    pipeline, inlier_px = coarse.prepared.pipeline, coarse.prepared.pipeline.options.pnp.inlier_px
+    failure = gate_failure(support.query.camera, support.matches, support.estimate.inliers, inlier_px, log10_chance)
+    return failure or unmoved_failure(support, inlier_px, pipeline.matcher.stationary, log10_chance)
+
+
+def _judged(support: PosedSupport, coarse: Coarse, chance: float, agreement: float) -> Answer:
+    """Accepts a pose or rejects it; `agreement` with directions counts if its evidence does not suffice otherwise."""
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options.judge
+    given = support.query_matches, prepared.options.coverage, options
+    with prepared.context.stage("judge"):
+        judged = judge(support, *given, chance, prepared.unit)
+        is_gated = judged.rejection is not None and judged.rejection.reason is RejectionReason.GATE
+        if is_gated and agreement != chance:
+            judged = judge(support, *given, agreement, prepared.unit)
+    if judged.rejection:
+        return coarse.answer(judged.rejection, support)
+    estimate = with_halves(support.estimate, judged.evidence.disagreement * support.distance_m())
+    checks = intrinsics_checks(estimate.intrinsics, options.intrinsics) if estimate.intrinsics else ()
+    return coarse.answer(Localization.of(estimate, judged.trust, None, checks), support)
+
+
+def _from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
+    """Estimates the pose from a single reference with a network's depths; priors are compared with it, but not used."""
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    assert isinstance(coarse.reconstruction, Reconstruction)
+    given = prepared.query, prepared.references, coarse.reconstruction, scale, prepared.correspondences.query_matches
+    with prepared.context.stage("pnp"):
+        fixed = prepared.pipeline.matcher.stationary
+        found = solve_one_reference(*given, prepared.origin, options.one_reference, fixed)
+    if isinstance(found, Rejection):
+        return coarse.answer(found)
+    estimate = found.support.estimate
+    checks = prepared.priors.check(estimate.world_from_camera, estimate.covariance)
+    estimate = replace(estimate, prior_checks=tuple(replace(it, used=False) for it in checks))
+    support = replace(found.support, estimate=estimate)
+    trust = trust_of_score(found.score)
+    failure = one_reference_failure(found, trust, prepared.options.coverage)
+    if failure:
+        return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
+    return coarse.answer(replace(Localization.of(estimate, trust), scale_source=scale.source), support)
+
+
+def _from_lines(coarse: Coarse) -> Answer:
+    """Estimates the pose from two-view and 2D-3D matches together; priors are compared with it, but not used.
+
+    A pose that its evidence does not accept is no hypothesis: its matches agree with many others, too.
+    """
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    query_matches = prepared.correspondences.query_matches
+    support = _two_view_support(coarse)
+    if support is None:
+        return coarse.answer(Rejection(RejectionReason.TOO_FEW_MATCHES, "no pose fits the epipolar lines of matches"))
+    with prepared.context.stage("judge"):
+        moved = without_unmoved(support, query_matches, prepared.pipeline.matcher.stationary)
+        evidence = two_view_evidence(moved, query_matches)
+        doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
+        votes = votes_of(support, query_matches)
+        rejection = None if doubt else contradiction(support, votes, options.judge, unit=prepared.unit)
+    if rejection:
+        return coarse.answer(rejection, support)
+    if doubt and lacks_distance(evidence):
+        return coarse.answer(one_reference_rejection(RejectionReason.LOW_OVERLAP, doubt, support))
+    if doubt or trust < 1 - prepared.options.coverage:
+        message = doubt or f"the trust of the pose from epipolar lines is {trust:.3f}"
+        return coarse.answer(Rejection(RejectionReason.TOO_FEW_MATCHES, message))
+    return coarse.answer(Localization.of(support.estimate, trust, support.two_view), support)
+
+
+def _two_view_support(coarse: Coarse) -> PosedSupport | None:
+    """Finds a pose from two-view matches and wide correspondences."""
+    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    query, references, context = prepared.query, prepared.references, prepared.context
+    query_matches, matcher = prepared.correspondences.query_matches, prepared.pipeline.matcher
+    with context.stage("two_view"):
+        wide = matcher.correspond(query, prepared.references_in_world, Matching.WIDE, context.check, query_matches)
+        stages = prepared.structure_options, prepared.match_options, options.adjust, prepared.options.intrinsics
+        result = solve_two_view(query, references, wide, (), prepared.origin, *stages)
+    if result is None:
+        return None
+    checks = prepared.priors.check(result.estimate.world_from_camera, result.estimate.covariance)
+    unused = tuple(replace(it, used=False) for it in checks)
+    return replace(result, estimate=replace(result.estimate, prior_checks=unused))

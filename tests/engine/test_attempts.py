@@ -1,0 +1,87 @@
+"""What is tried after a doubtful answer: each attempt a step of the queue, counted, and one row of a table."""
+
+from collections.abc import Sequence
+
+import pytest
+from support.planted_engine import (
+    DOUBTFUL_INLIERS,
+    SURE_INLIERS,
+    Setting,
+    caller,
+    localized,
+    query_of,
+    rejected,
+)
+
+from mapless_server.engine.query import Result
+from mapless_server.method import ladder
+from mapless_server.method.attempt import Attempt
+from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.judge.hypothesis import Doubt
+from mapless_server.method.ladder import Rung
+
+
+def ended(result: Result) -> list[tuple[str, str, bool]]:
+    return [(it.rung, it.outcome, it.is_chosen) for it in result.attempts]
+
+
+def test_a_sure_answer_is_one_attempt(setting: Setting) -> None:
+    setting.replies["cheap"] = localized(SURE_INLIERS)
+    assert ended(setting.localize()) == [("as it is", "localized", True)]
+
+
+def test_each_attempt_says_how_it_ended(setting: Setting) -> None:
+    setting.replies = {"cheap": rejected(), "strong": localized(SURE_INLIERS)}
+    result = setting.localize()
+    expected = [
+        ("as it is", "too_few_matches", False),
+        ("wide", "low_overlap", False),
+        ("lines", "low_overlap", False),
+        ("stronger", "localized", True),
+    ]
+    assert ended(result) == expected
+    assert [it.features for it in result.attempts] == ["cheap"] * 3 + ["strong"]
+    assert all(it.seconds > 0 and it.processor_s >= 0 for it in result.attempts)
+
+
+def test_a_rung_without_memory_leaves_the_best_answer(setting: Setting) -> None:
+    def full(*_: object) -> Answer:
+        raise MemoryError
+
+    setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": full}
+    result = setting.localize()
+    assert isinstance(result.answer.outcome, Localization)
+    assert ended(result) == [("as it is", "localized", True), ("stronger", "out_of_memory", False)]
+
+
+def test_better_answers_are_sent_before_the_last(setting: Setting) -> None:
+    setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
+    sent: list[Result] = []
+
+    async def run() -> Result:
+        job = setting.engine.query_job(query_of(("r0", "r1")), caller(), on_better=sent.append)
+        return await setting.engine.run(job)
+
+    final = setting.loop.run_until_complete(run())
+    assert [it.tier.features for it in [*sent, final]] == ["cheap", "strong"]
+    assert [len(it.attempts) for it in [*sent, final]] == [1, 2]
+
+
+def test_a_further_attempt_is_one_row(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rung that starts again without priors, first of all, whenever a pose has little trust."""
+    again = Rung(
+        "again",
+        "nothing but the use of priors",
+        Doubt.LOW_TRUST,
+        "nothing",
+        "structure and pose",
+        "again",
+        lambda before, _: before.but(uses_priors=False),
+        lambda *_: True,
+    )
+    monkeypatch.setattr(ladder, "RUNGS", (again, *ladder.RUNGS))
+    setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
+    result = setting.localize()
+    rungs: Sequence[str] = [it.rung for it in result.attempts]
+    assert rungs == ["as it is", "again", "stronger"]
+    assert again.change(Attempt(), None) != Attempt()
