@@ -15,8 +15,8 @@ from support.planted_engine import (
 
 from mapless_server.engine.query import Result
 from mapless_server.method import ladder
-from mapless_server.method.attempt import Attempt
 from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.judge.attempt import Attempt
 from mapless_server.method.judge.hypothesis import Doubt
 from mapless_server.method.ladder import Rung
 

@@ -190,9 +190,9 @@ def test_a_weak_answer_is_recomputed_from_wide_correspondences(monkeypatch: pyte
         self: Matcher,
         query: View,
         references: Sequence[PosedView],
-        matching: Matching,
-        check: Callable[[], None],
-        query_matches: Sequence[Matches] | None,
+        matching: Matching = Matching.STRICT,
+        check: Callable[[], None] = lambda: None,
+        query_matches: Sequence[Matches] | None = None,
     ) -> Correspondences:
         asked.append(matching)
         assert (query_matches is not None) == matching.is_wide, "the query is matched once"

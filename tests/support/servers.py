@@ -24,10 +24,10 @@ from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.stages import Method
-from mapless_server.method.attempt import Attempt, Solver
 from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.features.views import Features, Ignored, PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.judge.attempt import Attempt, Solver
 from mapless_server.method.judge.hypothesis import Found, found_by
 from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline

@@ -10,7 +10,7 @@ from functools import partial
 from scipy.special import bdtrc
 
 from mapless_server.errors import DataLoss
-from mapless_server.method.attempt import Where
+from mapless_server.method.judge.attempt import Where
 from mapless_server.method.judge.decide import CLEARLY_MORE
 from mapless_server.method.judge.hypothesis import Hypothesis
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, replace
 
-from mapless_server.method.attempt import Attempt
 from mapless_server.method.features.views import Matches, PosedView, View
+from mapless_server.method.judge.attempt import Attempt
 from mapless_server.method.rejection import PoseHypothesis
 from mapless_server.scenes import Choice
 

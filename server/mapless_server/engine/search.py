@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from mapless_server.method.attempt import Attempt, Where
+from mapless_server.method.judge.attempt import Attempt, Where
 from mapless_server.method.judge.hypothesis import Hypothesis
 from mapless_server.method.ladder import Situation, first_attempt
 from mapless_server.method.options import StageContext, Variant

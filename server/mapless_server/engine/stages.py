@@ -14,9 +14,9 @@ from functools import partial
 from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method import ladder, pipeline
 from mapless_server.method import localize as method
-from mapless_server.method.attempt import Attempt, Raster, Solver, Where
 from mapless_server.method.bundle.estimate import Support
 from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.judge.attempt import Attempt, Raster, Solver, Where
 from mapless_server.method.judge.decide import decide
 from mapless_server.method.judge.hypothesis import Doubt, Found, Hypothesis, found_by
 from mapless_server.method.options import DoubtOptions, Variant

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from mapless_server.method import ladder
-from mapless_server.method.attempt import Attempt, Where
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.judge.answer import Localization
+from mapless_server.method.judge.attempt import Attempt, Where
 from mapless_server.method.judge.hints import hinted
 from mapless_server.method.judge.hypothesis import Doubt, Found
 from mapless_server.method.judge.judge import trust_in_scene

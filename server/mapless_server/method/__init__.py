@@ -6,7 +6,6 @@ rejection        "no pose" is a result
 optim/           Levenberg-Marquardt, robust losses, small motions of poses
 features/        features of photographs, their matches, tracks
 pairs/           matches of posed photographs; whether photographs agree with their poses, and why not if not
-attempt          what one attempt at a pose is made of
 structure/       metric points of the references, 2D-3D matches of the query
 bundle/          bundle adjustment of everything together; covariance; priors
 options          the forms of the method that a request can choose; cancelling and timing of a computation

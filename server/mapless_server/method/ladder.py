@@ -7,7 +7,7 @@ to an attempt that was not tried yet; so after stronger features, or other refer
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 
-from .attempt import Attempt, Raster, Solver, Where
+from .judge.attempt import Attempt, Raster, Solver, Where
 from .judge.hypothesis import Doubt
 from .pairs.pair import Matching
 

@@ -8,14 +8,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from . import ladder
-from .attempt import Attempt
 from .bundle.priors import NO_PRIORS, Priors
 from .features.views import Matches, PosedView, View
 from .judge.answer import Answer
+from .judge.attempt import Attempt
 from .judge.decide import decide
 from .judge.hypothesis import Found, Hypothesis
 from .options import DoubtOptions, LocalizeOptions, StageContext, Variant
-from .pairs.pair import Matching
 from .pipeline import Coarse, Pipeline, Prepared, reconstruct
 from .rejection import Rejection, RejectionReason
 from .solve import solve
@@ -93,7 +92,9 @@ def prepare(
     nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
     bucket = pipeline.reconstructor.bucket(query, nearby)
     with context.stage("correspond"):
-        correspondences = pipeline.matcher.correspond(query, references, Matching.STRICT, context.check, query_matches)
+        correspondences = pipeline.matcher.correspond(
+            query, references, check=context.check, query_matches=query_matches
+        )
     return Prepared(
         query=query,
         references=nearby,

@@ -147,6 +147,11 @@ class Coarse:
     reconstruction: Outcome
     scale: MetricScale | Rejection
 
+    @property
+    def rejected_alone(self) -> Rejection | None:
+        """Why the photograph gives no initial pose without its priors; None if it does, or if that is not known."""
+        return self.reconstruction.without_priors if isinstance(self.reconstruction, Triangulation) else None
+
     def answer(self, outcome: Localization | Rejection, support: Support | None = None) -> Answer:
         """Makes the answer in the caller's world from an outcome in the world of `prepared`."""
         prepared, scale = self.prepared, None if isinstance(self.scale, Rejection) else self.scale
@@ -188,14 +193,19 @@ def coarse_answer(coarse: Coarse) -> Answer | None:
     return coarse.answer(unverified(coarse.scale, PoseStage.COARSE))
 
 
+def wide_correspondences(prepared: Prepared) -> Correspondences:
+    """The query's matches, and wide ones among its references."""
+    matcher, known = prepared.pipeline.matcher, prepared.correspondences.query_matches
+    check = prepared.context.check
+    return matcher.correspond(prepared.query, prepared.references_in_world, Matching.WIDE, check, known)
+
+
 def with_wide_correspondences(coarse: Coarse) -> Coarse:
     """The query with wide correspondences among the references, reconstructed again if the backend uses them."""
     prepared, reconstruction = coarse.prepared, coarse.reconstruction
     query, references, pipeline, context = prepared.query, prepared.references, prepared.pipeline, prepared.context
     with context.stage("correspond"):
-        known = prepared.correspondences.query_matches
-        in_world = prepared.references_in_world
-        correspondences = pipeline.matcher.correspond(query, in_world, Matching.WIDE, context.check, known)
+        correspondences = wide_correspondences(prepared)
         # What was left out is not among the known matches any more.
         correspondences = replace(correspondences, stationary_count=prepared.correspondences.stationary_count)
     with context.stage("coarse"):
@@ -265,13 +275,11 @@ def tracked_support(prepared: Prepared) -> Support | None:
     Without a reconstruction, the references' tracks and poses are enough to triangulate points, and the photograph's
     matches with the references lead to them through the tracks.
     """
-    query, references, check = prepared.query, prepared.references, prepared.context.check
+    query, references = prepared.query, prepared.references
     if len(references) < 2:
         return None
-    known = prepared.correspondences.query_matches
-    in_world = prepared.references_in_world
-    correspondences = prepared.pipeline.matcher.correspond(query, in_world, Matching.WIDE, check, known)
-    check()
+    correspondences = wide_correspondences(prepared)
+    prepared.context.check()
     structure = triangulated_structure(references, correspondences, StructureOptions())
     matches = vote(structure, [len(r.view.features) for r in references], correspondences)
     query_matches = tuple(correspondences.query_matches)

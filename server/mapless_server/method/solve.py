@@ -5,14 +5,14 @@ Where one reference is given the points are those of a network's depths; `Solver
 
 from dataclasses import replace
 
-from .attempt import Attempt, Solver
 from .bundle.adjust import adjust_pose, with_covariance
 from .bundle.estimate import PosedSupport, Support
+from .bundle.pose_problem import AdjustInput
 from .bundle.priors import NO_PRIORS
 from .bundle.radii import with_halves
-from .coarse import Triangulation
 from .features.views import Reconstruction
 from .judge.answer import Answer, Localization
+from .judge.attempt import Attempt, Solver
 from .judge.evidence import votes_of
 from .judge.fixed import unmoved_failure
 from .judge.hypothesis import Doubt, Found, found_by
@@ -28,11 +28,10 @@ from .judge.two_view import (
     without_unmoved,
 )
 from .options import DoubtOptions, Variant
-from .pairs.pair import Matching
-from .pipeline import Coarse, structure_and_matches, unverified, with_wide_correspondences
+from .pipeline import Coarse, structure_and_matches, unverified, wide_correspondences, with_wide_correspondences
 from .pose.one_reference import solve_one_reference
 from .pose.pnp import gate_failure, solve_pose
-from .pose.two_view import solve_two_view
+from .pose.two_view import TwoViewOptions, solve_two_view
 from .rejection import Rejection, RejectionReason
 from .structure.model import MetricScale, ScaleStage
 
@@ -53,7 +52,7 @@ def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
     if not attempt.uses_priors:
         answer = _compared(answer, coarse)
     found = found_by(attempt, answer, doubt)
-    rests_on_priors = isinstance(made.reconstruction, Triangulation) and made.reconstruction.without_priors is not None
+    rests_on_priors = made.rejected_alone is not None
     if rests_on_priors and Doubt.FEW_INLIERS in found.doubts:
         return replace(found, doubts=found.doubts | Doubt.ON_PRIOR_ALONE)
     return found
@@ -62,7 +61,7 @@ def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
 def _without_priors(coarse: Coarse) -> Coarse:
     """What the coarse stage gives without priors."""
     free = replace(coarse, prepared=replace(coarse.prepared, priors=NO_PRIORS))
-    if isinstance(coarse.reconstruction, Triangulation) and (alone := coarse.reconstruction.without_priors):
+    if alone := coarse.rejected_alone:
         return replace(free, reconstruction=alone, scale=alone)
     return free
 
@@ -107,12 +106,11 @@ def _from_points(coarse: Coarse) -> Answer:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), posed)
     if prepared.options.variant is Variant.BEST:
         with stage("adjust"):
-            given = query, references, structure, matches, estimate, options.adjust, priors, sigma
-            estimate = adjust_pose(*given, query_matches)
+            estimate = adjust_pose(AdjustInput.of(posed, options.adjust), estimate, priors)
     posed = support.posed(estimate)
     with stage("uncertainty"):
         predicted = not prepared.structure_options.optimize
-        estimate = with_covariance(posed, scale, options.adjust, priors, predicted, sigma)
+        estimate = with_covariance(posed, scale, options.adjust, priors, predicted)
     return _judged(replace(posed, estimate=estimate), coarse, chance, agreement)
 
 
@@ -190,11 +188,10 @@ def _two_view_support(coarse: Coarse) -> PosedSupport | None:
     """Finds a pose from two-view matches and wide correspondences."""
     prepared, options = coarse.prepared, coarse.prepared.pipeline.options
     query, references, context = prepared.query, prepared.references, prepared.context
-    query_matches, matcher = prepared.correspondences.query_matches, prepared.pipeline.matcher
     with context.stage("two_view"):
-        wide = matcher.correspond(query, prepared.references_in_world, Matching.WIDE, context.check, query_matches)
-        stages = prepared.structure_options, prepared.match_options, options.adjust, prepared.options.intrinsics
-        result = solve_two_view(query, references, wide, (), prepared.origin, *stages)
+        wide = wide_correspondences(prepared)
+        stages = TwoViewOptions(prepared.structure_options, prepared.match_options, options.adjust)
+        result = solve_two_view(query, references, wide, prepared.origin, stages, prepared.options.intrinsics)
     if result is None:
         return None
     checks = prepared.priors.check(result.estimate.world_from_camera, result.estimate.covariance)

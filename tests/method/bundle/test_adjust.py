@@ -102,7 +102,7 @@ def mean_errors(own: float, options: SceneOptions, seeds: int, drift: float = 0.
         centre = scene.world_from_query.translation
         references = drifted(references, centre, random_for("drifting", seed), *(drift * unit))
         structure, matches, estimate = stages(scene, references)
-        adjusted = adjust_pose(scene.query, references, structure, matches, estimate, AdjustOptions())
+        adjusted = adjust_pose(AdjustInput(scene.query, references, structure, matches, AdjustOptions()), estimate)
         before.append(pose_error(estimate.world_from_camera, scene.world_from_query))
         after.append(pose_error(adjusted.world_from_camera, scene.world_from_query))
     return np.mean(before, axis=0), np.mean(after, axis=0)
@@ -139,7 +139,7 @@ def test_references_in_another_room_do_not_change_the_pose() -> None:
     structure, matches, estimate = stages(scene, references)
     far = [replace(it, world_from_camera=it.world_from_camera.shifted([200.0, 0, 0])) for it in references[:7]]
     alone, beside = (
-        adjust_pose(scene.query, views, structure, matches, estimate, AdjustOptions())
+        adjust_pose(AdjustInput(scene.query, views, structure, matches, AdjustOptions()), estimate)
         for views in (references, (*references, *far))
     )
     assert_pose_close(beside.world_from_camera, alone.world_from_camera, metres=1e-6, degrees=1e-5)
@@ -150,7 +150,7 @@ def test_a_rough_pose_converges_to_the_planted_one() -> None:
     structure, matches = true_structure(scene, NOISE)
     rough = RigidTransform(scene.world_from_query.rotation, scene.world_from_query.translation + [0.01, -0.01, 0.02])
     estimate = cheated_estimate(scene, matches, rough, error_px=1.0)
-    adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
+    adjusted = adjust_pose(AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions()), estimate)
     assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=1e-4, degrees=1e-3)
     assert np.median(adjusted.errors_px) < 0.01
 
@@ -173,8 +173,8 @@ def with_few_points(case: str, count: int, wrong_share: float = 0.0) -> tuple[Po
         wrong = found[random.random(len(found)) < wrong_share, 1]
         found[np.isin(found[:, 1], wrong), 1] = random.permutation(wrong)
         query_matches.append(found)
-    given = scene.query, scene.references, structure, matches, estimate, AdjustOptions()
-    before, after = adjust_pose(*given), adjust_pose(*given, query_matches=query_matches)
+    given = AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions())
+    before, after = (adjust_pose(it, estimate) for it in (given, replace(given, query_matches=query_matches)))
     errors = [pose_error(it.world_from_camera, scene.world_from_query) for it in (before, after)]
     return before, after, np.array(errors)
 
@@ -205,7 +205,7 @@ def test_matches_with_large_errors_are_not_used() -> None:
     wrong = replace(matches, keypoint=swapped)
     estimate = solve_pose(scene.query, structure, wrong, scene.world_from_query, PnpOptions())
     assert isinstance(estimate, PoseEstimate)
-    adjusted = adjust_pose(scene.query, scene.references, structure, wrong, estimate, AdjustOptions())
+    adjusted = adjust_pose(AdjustInput(scene.query, scene.references, structure, wrong, AdjustOptions()), estimate)
     assert_pose_close(adjusted.world_from_camera, scene.world_from_query, metres=1e-3, degrees=0.01)
 
 
@@ -217,7 +217,7 @@ def test_fewer_matches_than_unknowns_change_nothing(count: int) -> None:
     errors_px = estimate.errors_px.copy()
     errors_px[:count] = 0.5
     estimate = replace(estimate, errors_px=errors_px)
-    adjusted = adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions())
+    adjusted = adjust_pose(AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions()), estimate)
     if count < 3:
         assert adjusted is estimate
     assert np.isfinite(adjusted.world_from_camera.matrix()).all()
@@ -229,6 +229,6 @@ def test_matches_with_one_point_raise_no_exception() -> None:
     estimate = cheated_estimate(scene, matches, scene.world_from_query, error_px=0.5)
     for points in (np.zeros_like(structure.x_in_world), np.full_like(structure.x_in_world, np.nan)):
         nowhere = replace(structure, x_in_world=points)
-        adjusted = adjust_pose(scene.query, scene.references, nowhere, matches, estimate, AdjustOptions())
+        adjusted = adjust_pose(AdjustInput(scene.query, scene.references, nowhere, matches, AdjustOptions()), estimate)
         assert np.isfinite(adjusted.world_from_camera.matrix()).all()
         assert np.isfinite(adjusted.covariance).all()

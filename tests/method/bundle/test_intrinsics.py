@@ -76,7 +76,7 @@ def misread(scene: SyntheticScene, errors: tuple[float, ...], distortion: Distor
 
 def adjusted(scene: SyntheticScene, sigma: IntrinsicsSigma | None = None) -> PoseEstimate:
     structure, matches, estimate = stages(scene, scene.references)
-    return adjust_pose(scene.query, scene.references, structure, matches, estimate, AdjustOptions(), intrinsics=sigma)
+    return adjust_pose(AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions(), sigma), estimate)
 
 
 @pytest.mark.parametrize("lens", [None, Division(-0.2)], ids=["pinhole", "without k1"])

@@ -35,6 +35,7 @@ from mapless_server.method.bundle.pose_problem import (
     OWN_INFLATION,
     USUAL_DRIFT,
     USUAL_OWN,
+    AdjustInput,
     AdjustOptions,
     PoseErrors,
     most_probable,
@@ -88,7 +89,9 @@ def adjusted_poses(
         centre = scene.world_from_query.translation
         noisy = drifted(noisy, centre, random, drift * planted.distance_m, np.degrees(drift))
         structure, matches, estimate = stages(scene, noisy)
-        adjusted = adjust_pose(scene.query, noisy, structure, matches, estimate, AdjustOptions(uncertainty=options))
+        adjusted = adjust_pose(
+            AdjustInput(scene.query, noisy, structure, matches, AdjustOptions(uncertainty=options)), estimate
+        )
         support = Support(scene.query, noisy, structure, matches, np.zeros(3)).posed(adjusted)
         query_matches = true_correspondences(scene).query_matches
         halves = evidence_of(support, votes_of(support, query_matches), query_matches)

@@ -235,7 +235,7 @@ def adjusted(
     """Solved without priors, adjusted with them."""
     solved = solve_pose(scene.query, structure, matches, scene.world_from_query, PnpOptions())
     assert isinstance(solved, PoseEstimate)
-    return adjust_pose(scene.query, scene.references, structure, matches, solved, AdjustOptions(), priors)
+    return adjust_pose(AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions()), solved, priors)
 
 
 def test_gradient_with_priors_equals_finite_differences() -> None:
@@ -291,7 +291,7 @@ def test_unused_priors_do_not_change_the_answer() -> None:
     pulled_to = moved(solved.world_from_camera, np.array([0.01, 0, 0, 0.002, 0, 0]))
     pulled = replace(solved, world_from_camera=pulled_to, errors_px=solved.errors_px + 1, without_priors=solved)
     priors = Priors(gravity=gravity_at(scene.world_from_query, 3.0))
-    given = scene.query, scene.references, structure, matches
-    answer, alone = adjust_pose(*given, pulled, AdjustOptions(), priors), adjust_pose(*given, solved, AdjustOptions())
+    given = AdjustInput(scene.query, scene.references, structure, matches, AdjustOptions())
+    answer, alone = adjust_pose(given, pulled, priors), adjust_pose(given, solved)
     assert [check.used for check in answer.prior_checks] == [False]
     assert answer.world_from_camera.matrix().tobytes() == alone.world_from_camera.matrix().tobytes()

@@ -35,10 +35,9 @@ from mapless_server.method.pairs.correspond import Correspondences, Matcher
 from mapless_server.method.pairs.epipolar import sampson_px
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pose.two_view import solve_two_view
+from mapless_server.method.pose.two_view import TwoViewOptions, solve_two_view
 from mapless_server.method.pose.two_view_matches import TwoViewMatches
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
-from mapless_server.method.structure.match import MatchOptions
 from mapless_server.method.structure.structure import StructureOptions
 
 TRUE = RigidTransform(rotation_from_vector([0.1, -0.15, 0.05]), np.array([0.3, -0.1, -4.2]))
@@ -55,8 +54,8 @@ class Planted:
     correspondences: Correspondences
 
     def solved(self, intrinsics: IntrinsicsSigma | None = None) -> PosedSupport | None:
-        stages = StructureOptions(), MatchOptions(), AdjustOptions(), intrinsics
-        return solve_two_view(self.query, self.references, self.correspondences, (), ORIGIN, *stages)
+        matched = self.correspondences
+        return solve_two_view(self.query, self.references, matched, ORIGIN, TwoViewOptions(), intrinsics)
 
     def evidence(self, support: PosedSupport) -> TwoViewEvidence:
         return two_view_evidence(support, self.correspondences.query_matches)
@@ -160,10 +159,8 @@ def test_covariance_is_right_against_planted_noise(pose_noise_px: float) -> None
     plain = AdjustOptions(uncertainty=UncertaintyOptions(position_factor=1.0, rotation_factor=1.0, gap_growth=0.0))
     for seed in range(16):
         problem = planted((60, 60, 60), 0.5, 0.0, seed, pose_noise_px)
-        support = solve_two_view(
-            problem.query, problem.references, problem.correspondences, (), ORIGIN,
-            StructureOptions(), MatchOptions(), plain,
-        )  # fmt: skip
+        matched, stages = problem.correspondences, TwoViewOptions(adjust=plain)
+        support = solve_two_view(problem.query, problem.references, matched, ORIGIN, stages)
         assert support is not None
         assert support.estimate is not None
         errors.append(error_of(support.estimate.world_from_camera))

@@ -15,14 +15,13 @@ What the photograph says of their errors follows from the same normal equations,
 Priors on the query's pose add their terms, unless the photograph alone contradicts them.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ..features.tracks import Tracks
-from ..features.views import Matches, PosedView, View
-from ..structure.model import MetricScale, PointMatches, Structure
+from ..features.views import PosedView
+from ..structure.model import MetricScale
 from ..structure.structure import query_tracks, with_query_points
 from .dispersion import scale_covariance
 from .estimate import PosedSupport, PoseEstimate, PoseStage
@@ -47,42 +46,21 @@ references' points too, and moves the pose but little: focus and stabilization r
 errors exceeds all others in scenes of one camera, where radii hold too often."""
 
 
-def adjust_pose(
-    query: View,
-    references: Sequence[PosedView],
-    structure: Structure,
-    matches: PointMatches,
-    estimate: PoseEstimate,
-    options: AdjustOptions,
-    priors: Priors = NO_PRIORS,
-    intrinsics: IntrinsicsSigma | None = None,
-    query_matches: Sequence[Matches] = (),
-) -> PoseEstimate:
+def adjust_pose(given: AdjustInput, estimate: PoseEstimate, priors: Priors = NO_PRIORS) -> PoseEstimate:
     """Refines an estimate together with its points and, within their noise, the references.
 
     Args:
-        query: the query.
-        references: the references, in the order of the structure's tracks.
-        structure: metric points.
-        matches: 2D-3D matches of the query with these points.
+        given: what the pose is adjusted to.
         estimate: the initial pose; its errors select the matches.
-        options: of the adjustment.
         priors: on the query's pose. Each is checked against the pose from the photograph alone; only consistent ones
             are used.
-        intrinsics: standard deviations of the query's intrinsics; None for the defaults.
-        query_matches: matches of the query with each reference; where many belong to no point, they are used too.
 
     Returns:
         The estimate with a refined pose and its covariance; unchanged if the adjustment fails.
     """
-    given = AdjustInput(query, references, structure, matches, options)
-
-    def adjusted(start: PoseEstimate, active: Priors) -> tuple[PoseEstimate, Solved | None] | None:
-        return _adjusted(given, start, active, intrinsics, query_matches)
-
     # If no prior is used, the answer is bit-identical to the one without priors.
     without_priors = estimate.without_priors or estimate
-    alone, where = adjusted(without_priors, NO_PRIORS) or (None, None)
+    alone, where = _adjusted(given, without_priors, NO_PRIORS) or (None, None)
     if not priors:
         return alone or without_priors
     checks = priors.check(alone.world_from_camera, alone.covariance) if alone else estimate.prior_checks
@@ -90,7 +68,7 @@ def adjust_pose(
     answer = alone or without_priors
     if used:
         informed = _with_priors(alone, where, used) if alone and where else None
-        answer = informed or (adjusted(estimate, used) or (estimate, None))[0]
+        answer = informed or (_adjusted(given, estimate, used) or (estimate, None))[0]
     return replace(answer, prior_checks=checks)
 
 
@@ -115,20 +93,14 @@ def _of_matches(found: PoseEstimate, count: int) -> PoseEstimate:
     return replace(found, inliers=found.inliers[:count], errors_px=found.errors_px[:count])
 
 
-def _adjusted(
-    given: AdjustInput,
-    estimate: PoseEstimate,
-    priors: Priors,
-    intrinsics: IntrinsicsSigma | None,
-    query_matches: Sequence[Matches],
-) -> tuple[PoseEstimate, Solved | None] | None:
+def _adjusted(given: AdjustInput, estimate: PoseEstimate, priors: Priors) -> tuple[PoseEstimate, Solved | None] | None:
     """Returns the estimate at the optimum with priors, and where that is; None if it diverges or has too few matches.
 
     Points of the query's own are chosen at its pose, with whatever error the intrinsics give it, so they hide a part
     of this error: intrinsics that seem wrong with them are judged, and estimated, without them.
     """
-    terms = intrinsics_terms(given.query, given.references, intrinsics)
-    own = _own_tracks(given, estimate, query_matches)
+    terms = intrinsics_terms(given)
+    own = _own_tracks(given, estimate)
     is_agreeing = estimate.inliers.mean() >= given.options.agreeing_share
     first = _at_optimum(given, estimate, priors, terms, own) if own and is_agreeing else None
     if first and not is_suspicious(first[0], given.options):
@@ -144,11 +116,11 @@ def _adjusted(
     return _sharpened(better, priors), where if better.view is None else None
 
 
-def _own_tracks(given: AdjustInput, estimate: PoseEstimate, query_matches: Sequence[Matches]) -> Tracks | None:
+def _own_tracks(given: AdjustInput, estimate: PoseEstimate) -> Tracks | None:
     """Tracks of the query's keypoints that match references but no point; None if these are few."""
     free = np.ones(len(given.query.features), bool)
     free[given.matches.keypoint] = False
-    tracks = query_tracks(given.references, given.structure, query_matches, free)
+    tracks = query_tracks(given.references, given.structure, given.query_matches, free)
     is_many = tracks.point_count > 0 and tracks.point_count >= given.options.min_added_share * estimate.inliers.sum()
     return tracks if is_many else None
 
@@ -181,13 +153,11 @@ def _at_optimum(
     return None if found is None else (_of_matches(found, count), solved)
 
 
-def intrinsics_terms(
-    query: View, references: Sequence[PosedView], intrinsics: IntrinsicsSigma | None
-) -> IntrinsicsTerms:
-    """A photograph with its intrinsics as given, and standard deviations; None for the defaults."""
-    usual = (intrinsics or IntrinsicsSigma()).of(query.camera)
-    is_shared = intrinsics is None and shares_camera(query, references)
-    return IntrinsicsTerms(query, usual, SHARED_CAMERA * usual if is_shared else usual)
+def intrinsics_terms(given: AdjustInput) -> IntrinsicsTerms:
+    """What is known of the query's intrinsics without its matches."""
+    usual = (given.intrinsics or IntrinsicsSigma()).of(given.query.camera)
+    is_shared = given.intrinsics is None and shares_camera(given.query, given.references)
+    return IntrinsicsTerms(given.query, usual, SHARED_CAMERA * usual if is_shared else usual)
 
 
 def with_covariance(
@@ -196,7 +166,6 @@ def with_covariance(
     options: AdjustOptions,
     priors: Priors = NO_PRIORS,
     points_are_predicted: bool = False,
-    intrinsics: IntrinsicsSigma | None = None,
 ) -> PoseEstimate:
     """The estimate with the covariance of its pose, and the evidence of errors of its intrinsics.
 
@@ -207,10 +176,6 @@ def with_covariance(
         priors: on the pose; those that were used reduce the covariance.
         points_are_predicted: whether the structure's points are predicted by the reconstruction, rather than
             triangulated from the references' poses.
-        intrinsics: standard deviations of the query's intrinsics; None for the defaults.
-
-    Raises:
-        ValueError: there is no estimate.
     """
     estimate, references = support.estimate, support.references
     if estimate.is_adjusted:
@@ -219,9 +184,9 @@ def with_covariance(
     if len(used) < 3:
         return estimate
     pose, is_initial = estimate.world_from_camera, estimate.stage is PoseStage.INITIAL
-    given = AdjustInput(support.query, references, support.structure, support.matches, options)
+    given = AdjustInput.of(support, options)
     problem, there = pose_problem(given, used, pose)
-    solved, terms = Solved(given, problem, there, used), intrinsics_terms(support.query, references, intrinsics)
+    solved, terms = Solved(given, problem, there, used), intrinsics_terms(given)
     errors = errors_of_pose(solved, terms, is_initial)
     if errors is None:
         return estimate

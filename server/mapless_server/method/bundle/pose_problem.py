@@ -36,14 +36,14 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 
-from ..features.views import PosedView, View
+from ..features.views import Matches, PosedView, View
 from ..optim.optimize import MinimizeOptions, minimize
 from ..optim.perturbation import world_jacobian
 from ..structure.model import PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, bundle_of
 from .dispersion import UncertaintyOptions, disperse, dispersed_covariance
-from .estimate import PoseEstimate, PoseStage
+from .estimate import PoseEstimate, PoseStage, Support
 from .intrinsics import (
     ContradictionOptions,
     IntrinsicsEvidence,
@@ -52,7 +52,7 @@ from .intrinsics import (
     keypoint_motion,
 )
 from .normal_equations import Linearized, NormalEquations
-from .unknowns import Bundle, Poses
+from .unknowns import Bundle, IntrinsicsSigma, Poses
 
 LEAST_DAMPING = 1e-9
 """Keeps the points determined where they are eliminated at the given poses."""
@@ -143,6 +143,8 @@ class AdjustInput:
         structure: metric points.
         matches: 2D-3D matches of the query with these points.
         options: of the adjustment.
+        intrinsics: standard deviations of the query's intrinsics; None for the defaults.
+        query_matches: matches of the query with each reference; where many belong to no point, they are used too.
     """
 
     query: View
@@ -150,6 +152,16 @@ class AdjustInput:
     structure: Structure
     matches: PointMatches
     options: AdjustOptions
+    intrinsics: IntrinsicsSigma | None = None
+    query_matches: Sequence[Matches] = ()
+
+    @staticmethod
+    def of(support: Support, options: AdjustOptions) -> "AdjustInput":
+        """The data of a support."""
+        it = support
+        return AdjustInput(
+            it.query, it.references, it.structure, it.matches, options, it.intrinsics_sigma, it.query_matches
+        )
 
     def errors_px(self, world_from_query: RigidTransform, rows: slice = slice(None)) -> Array:
         """Reprojection errors (M,) of matches at a pose, pixels; NaN behind the camera."""

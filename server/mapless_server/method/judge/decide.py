@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 
-from ..attempt import Raster
 from ..bundle.estimate import Support
 from ..bundle.priors import Priors
 from ..bundle.radii import accuracy_from_covariance
@@ -28,6 +27,7 @@ from ..pose.relative import RelativePoseOptions
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .answer import Localization
+from .attempt import Raster
 from .evidence import Votes, votes_of
 from .hypothesis import Doubt, Failed, Found, Hypothesis
 

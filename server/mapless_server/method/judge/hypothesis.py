@@ -7,12 +7,12 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
-from ..attempt import Attempt
 from ..bundle.estimate import PosedSupport
 from ..bundle.radii import accuracy_from_covariance
 from ..options import DoubtOptions
 from ..rejection import Rejection, RejectionReason
 from .answer import Answer, Localization
+from .attempt import Attempt
 
 
 class Doubt(Flag):

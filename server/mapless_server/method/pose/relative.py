@@ -2,7 +2,6 @@
 
 Candidates, of which the one with the highest score is taken:
 
-    - poses that the caller knows;
     - PnP on the 2D-3D matches, if there are any;
     - the generalized relative pose: five matches with one reference and one with another (PoseLib);
     - for each of the references with the most matches, the relative pose up to its unknown distance (five points), and
@@ -13,7 +12,7 @@ The score is sum (1 - r^2 / r_max^2) log10(1 / p) over the inliers, with residua
 is an inlier: an epipolar line excludes less of the image than a point, so such a match counts less.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -97,11 +96,9 @@ def band_chance(camera: Camera, epipolar_px: float) -> float:
     return float(min(1.0, 2 * np.sqrt(2) * epipolar_px * length_px / (camera.width_px * camera.height_px)))
 
 
-def find_pose(
-    evidence: Evidence, options: RelativePoseOptions, known: Iterable[RigidTransform] = ()
-) -> RigidTransform | None:
+def find_pose(evidence: Evidence, options: RelativePoseOptions) -> RigidTransform | None:
     """Returns the world_from_query with the highest score, not refined; None without a candidate."""
-    candidates = [*known, *_from_points(evidence, options), *_generalized(evidence, options)]
+    candidates = [*_from_points(evidence, options), *_generalized(evidence, options)]
     for reference in _strongest(evidence.two_view, options):
         candidates += _by_distance(evidence, reference, options)
     if not candidates:

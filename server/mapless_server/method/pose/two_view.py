@@ -7,7 +7,7 @@ point without its only reference has no information.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from mapless.geometry import Array, RigidTransform
 
 from ..bundle.adjust import adjust_pose
 from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage, TwoViewSupport
-from ..bundle.pose_problem import AdjustOptions
+from ..bundle.pose_problem import AdjustInput, AdjustOptions
 from ..bundle.unknowns import IntrinsicsSigma
 from ..features.tracks import Tracks
 from ..features.views import PosedView, View
@@ -40,32 +40,37 @@ MIN_INLIERS = 8
 """Fewer matches do not determine a pose with any redundancy."""
 
 
+@dataclass(frozen=True)
+class TwoViewOptions:
+    """Options of the stages that find the points and matches, and of the adjustment."""
+
+    structure: StructureOptions = field(default_factory=StructureOptions)
+    match: MatchOptions = field(default_factory=MatchOptions)
+    adjust: AdjustOptions = field(default_factory=AdjustOptions)
+
+
 def solve_two_view(
     query: View,
     references: Sequence[PosedView],
     correspondences: Correspondences,
-    known: Sequence[RigidTransform],
     origin: Array,
-    structure_options: StructureOptions,
-    match_options: MatchOptions,
-    adjust_options: AdjustOptions,
+    options: TwoViewOptions,
     intrinsics: IntrinsicsSigma | None = None,
 ) -> PosedSupport | None:
     """Finds the pose that most matches of both kinds support, with these matches; None if there is none.
 
-    There are two or more references, and matches between all photographs. The poses world_from_query of other stages,
-    `known`, are candidates too; for `origin` (3,) of their world see `Support`. `intrinsics` are standard deviations of
-    those of the query; None for the defaults.
+    There are two or more references, and matches between all photographs; for `origin` (3,) of their world see
+    `Support`. `intrinsics` are standard deviations of those of the query; None for the defaults.
     """
-    structure = triangulated_structure(references, correspondences, structure_options)
+    structure = triangulated_structure(references, correspondences, options.structure)
     matches = vote(structure, [len(it.view.features) for it in references], correspondences)
     two_view = TwoViewMatches.of(query, references, correspondences.query_matches)
     evidence = Evidence(query, references, two_view, structure.x_in_world[matches.point], matches.keypoint)
-    pose = find_pose(evidence, POSE, known)
+    pose = find_pose(evidence, POSE)
     if pose is None:
         return None
-    searched = match_points(query, references, structure, correspondences, pose, match_options)
-    problem = _Problem(evidence, structure, searched, adjust_options, intrinsics)
+    searched = match_points(query, references, structure, correspondences, pose, options.match)
+    problem = _Problem(evidence, structure, searched, options.adjust, intrinsics)
     best = problem.at(pose)
     for _ in range(ROUNDS):
         adjusted = problem.adjusted(best)
@@ -146,8 +151,8 @@ class _Problem:
         errors_px = np.concatenate([start.errors_px, start.support.errors_px[used]])
         inliers = np.concatenate([start.inliers, np.ones(len(rows), bool)])
         before = PoseEstimate(start.world_from_query, PoseStage.REFINED, inliers, errors_px, np.eye(6))
-        given = self.evidence.query, self.evidence.references, structure, matches, before, self.adjust
-        estimate = adjust_pose(*given, intrinsics=self.intrinsics)
+        query, references = self.evidence.query, self.evidence.references
+        estimate = adjust_pose(AdjustInput(query, references, structure, matches, self.adjust, self.intrinsics), before)
         if not estimate.is_adjusted:
             return None
         found = self.at(estimate.world_from_camera)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from .pairs.pair import Matching
+from ..pairs.pair import Matching
 
 
 class Raster(Enum):
