@@ -122,7 +122,7 @@ class GivenMatches(Matcher):
         super().__init__()
         self._matches = matches
 
-    def correspond(self, *_: object) -> Correspondences:
+    def correspond(self, *_: object, **__: object) -> Correspondences:
         return Correspondences({}, (self._matches,))
 
 
