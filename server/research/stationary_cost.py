@@ -13,14 +13,14 @@ from statistics import median
 from mapless_server.cache import LruCache
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.features.extractors import SiftExtractor
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.judge.answer import Answer
-from mapless_server.method.judge.fixed import unmoved_failure
+from mapless_server.method.judge.references import unmoved_failure
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pairs.correspond import references_without_fixed, without_fixed
 from mapless_server.method.pairs.pair import Matching, PairKey, PairMatches
 from mapless_server.method.pairs.stationary import StationaryOptions, stationary_matches
-from mapless_server.method.pairs.stationary_filter import references_without_fixed, without_fixed
 from mapless_server.method.pipeline import Pipeline
 
 from .evidence.overlays import OVERLAYS, Overlay

@@ -1,7 +1,9 @@
 """What is tried after a doubtful answer: each attempt a step of the queue, counted, and one row of a table."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from support.planted_engine import (
     DOUBTFUL_INLIERS,
@@ -12,13 +14,15 @@ from support.planted_engine import (
     query_of,
     rejected,
 )
+from support.servers import pose
 
 from mapless_server.engine.query import Result
 from mapless_server.method import ladder
+from mapless_server.method.bundle.priors import PositionPrior, Priors
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.judge.attempt import Attempt
-from mapless_server.method.judge.hypothesis import Doubt
+from mapless_server.method.judge.hypothesis import Attempt, Doubt
 from mapless_server.method.ladder import Rung
+from mapless_server.scenes import Narrowing
 
 
 def ended(result: Result) -> list[tuple[str, str, bool]]:
@@ -42,6 +46,18 @@ def test_each_attempt_says_how_it_ended(setting: Setting) -> None:
     assert ended(result) == expected
     assert [it.features for it in result.attempts] == ["cheap"] * 3 + ["strong"]
     assert all(it.seconds > 0 and it.processor_s >= 0 for it in result.attempts)
+
+
+@pytest.mark.parametrize("seen", [2, 3], ids=["one is outside", "all are near"])
+def test_after_a_search_elsewhere_stronger_features_are_tried(setting: Setting, seen: int) -> None:
+    """Whether or not the search elsewhere was skipped, since it would have had the same references."""
+    setting.replies = dict.fromkeys(("cheap", "strong"), rejected())
+    priors = Priors(position=PositionPrior(pose(0.0).translation, (0.1 if seen == 2 else 4.0) ** 2 * np.eye(3)))
+    narrowing = replace(Narrowing.of(priors), margin_m=0.01)
+    result = setting.localize(reference_ids=(), reference_count=3, priors=priors, narrowing=narrowing)
+    by_rung = {it.rung: it.outcome for it in result.attempts}
+    assert (by_rung["elsewhere"] == "skipped") is (seen == 3)
+    assert by_rung["stronger"] == "too_few_matches"
 
 
 def test_a_rung_without_memory_leaves_the_best_answer(setting: Setting) -> None:

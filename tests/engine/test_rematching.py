@@ -13,7 +13,7 @@ from support.servers import whole
 from mapless_server.engine.search import SearchStep
 from mapless_server.engine.stages import QueryStages
 from mapless_server.method.features.views import Matches, View
-from mapless_server.method.judge.attempt import Attempt
+from mapless_server.method.judge.hypothesis import Attempt
 from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline

@@ -18,8 +18,8 @@ from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photos import Photo
 from mapless_server.engine.query import TRACK, Caller, Query, Result, Tier
 from mapless_server.errors import DataLoss
+from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.bundle.priors import NO_PRIORS, HeadingPrior, PosePrior, PositionPrior, Priors
-from mapless_server.method.bundle.radii import accuracy_from_covariance
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions, Variant

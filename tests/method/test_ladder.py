@@ -3,8 +3,7 @@
 import pytest
 
 from mapless_server.method import ladder
-from mapless_server.method.judge.attempt import Attempt, Raster, Solver, Where
-from mapless_server.method.judge.hypothesis import Doubt
+from mapless_server.method.judge.hypothesis import Attempt, Doubt, Raster, Solver, Where
 from mapless_server.method.ladder import RUNGS, Situation, first_attempt, further
 from mapless_server.method.pairs.pair import Matching
 

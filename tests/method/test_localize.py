@@ -24,8 +24,14 @@ from support.planted import moved_references
 from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg, rotation_from_vector
-from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage
-from mapless_server.method.bundle.radii import JACKKNIFE_SHARE, accuracy_from_covariance, with_halves
+from mapless_server.method.bundle.estimate import (
+    JACKKNIFE_SHARE,
+    PosedSupport,
+    PoseEstimate,
+    PoseStage,
+    accuracy_from_covariance,
+    with_halves,
+)
 from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.judge.evidence import evidence_of, votes_of
 from mapless_server.method.localize import localize

@@ -28,10 +28,10 @@ from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.features.views import View
 from mapless_server.method.judge.answer import Answer
-from mapless_server.method.localize import localize, prepare, refine
+from mapless_server.method.localize import localize, refine
 from mapless_server.method.options import LocalizeOptions, StageContext, Variant
 from mapless_server.method.pairs.correspond import Matcher
-from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, coarse_answer, reconstruct
+from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, coarse_answer, prepare, reconstruct
 from mapless_server.method.rejection import RejectionReason
 
 

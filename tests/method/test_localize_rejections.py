@@ -28,10 +28,10 @@ from mapless.geometry import RigidTransform
 from mapless_server.method import solve
 from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.features.views import Features, Reconstruction, View
-from mapless_server.method.localize import MIN_FEATURES, localize
+from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, ScaleStrategy, Variant
 from mapless_server.method.pairs.correspond import Matcher
-from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.pipeline import MIN_FEATURES, Pipeline
 from mapless_server.method.pose import pnp
 from mapless_server.method.rejection import RejectionReason
 

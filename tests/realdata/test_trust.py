@@ -10,8 +10,8 @@ import pytest
 from scipy.special import bdtrik
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.bundle.priors import NO_PRIORS, GravityPrior, Priors
-from mapless_server.method.bundle.radii import accuracy_from_covariance
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason

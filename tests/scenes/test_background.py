@@ -20,7 +20,7 @@ from support.stores import DATABASES, Folder, Place, damage, let_pass, place_on
 from support.waiting import wait_until
 
 from mapless_server.errors import Unavailable
-from mapless_server.method.features import matching, nearest
+from mapless_server.method.features import matching
 from mapless_server.method.features.matching import CorrespondOptions, PairMatching, StoredPair
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.options import StageContext
@@ -138,7 +138,7 @@ def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
         return compare
 
     for module, name in (reference_pairs, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
-        monkeypatch.setattr(module, name, counting(getattr(nearest, name)))
+        monkeypatch.setattr(module, name, counting(getattr(matching, name)))
     return counts
 
 

@@ -15,8 +15,8 @@ from support.stores import Folder, Place, let_pass
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.errors import Unavailable
+from mapless_server.method.bundle.estimate import USUAL_GAP, Accuracy, growth
 from mapless_server.method.bundle.intrinsics import corrected_view
-from mapless_server.method.bundle.radii import USUAL_GAP, Accuracy, growth
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.judge import LEVELS, trust_in_scene
 from mapless_server.method.pipeline import Pipeline

@@ -7,7 +7,7 @@ import pytest
 from support.programs import printed
 
 from mapless_server.method.features.extractors import make_extractor
-from mapless_server.method.features.nearest import Arithmetic, fastest_arithmetic
+from mapless_server.method.features.matching import Arithmetic, fastest_arithmetic
 from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsMissing

@@ -20,7 +20,7 @@ from support.wall import wall
 
 from mapless import Camera, Client, LocalizationResult, NewReference, RigidTransform
 from mapless.geometry import rotation_from_vector
-from mapless_server.method.bundle.radii import accuracy_from_covariance
+from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.store import Store
 from mapless_tools.calibrate.claims import Claim, Sample, fit_factors
 

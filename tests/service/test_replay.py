@@ -38,7 +38,7 @@ from mapless import (
 )
 from mapless.geometry import RigidTransform as Pose
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.method.judge.attempt import Attempt
+from mapless_server.method.judge.hypothesis import Attempt
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call, encode_call
 from mapless_server.services.capture.files import blob_path, calls_of
 from mapless_server.settings import load_settings

@@ -19,7 +19,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.options import EngineOptions
 from mapless_server.images import ImageLimits
-from mapless_server.method.bundle.unknowns import IntrinsicsSigma
+from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.services.messages.answers import (
     axes_from_message,

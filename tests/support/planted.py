@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.bundle.estimate import PoseEstimate
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.pairs.correspond import Correspondences

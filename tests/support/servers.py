@@ -27,8 +27,7 @@ from mapless_server.engine.stages import Method
 from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.features.views import Features, Ignored, PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.judge.attempt import Attempt, Solver
-from mapless_server.method.judge.hypothesis import Found, found_by
+from mapless_server.method.judge.hypothesis import Attempt, Found, Solver, found_by
 from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason

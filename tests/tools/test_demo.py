@@ -17,7 +17,7 @@ from support import corner
 from mapless import Camera, Client, LocalizationResult, Rejected, RigidTransform
 from mapless.diagnostics import Debug, Diagnostics, ReferenceUse
 from mapless_server.method.features.extractors import SiftExtractor
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 from mapless_tools.child import ChildServer
 from mapless_tools.demo import Photograph, Place, depth_map_m, room, run
 from mapless_tools.demo.photographs import ROOM

@@ -9,17 +9,16 @@ from functools import partial
 
 from scipy.special import bdtrc
 
+from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
-from mapless_server.method.judge.attempt import Where
 from mapless_server.method.judge.decide import CLEARLY_MORE
-from mapless_server.method.judge.hypothesis import Hypothesis
+from mapless_server.method.judge.hypothesis import Hypothesis, Where
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Choice, Narrowing, Selection
 from mapless_server.scenes.library import Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
 
 from . import tracking
-from .material import Material
 from .photos import QueryViews, RasterForm
 from .query import TURN, Tier
 from .search import Search
@@ -41,7 +40,7 @@ def described_anew(search: Search, tier: Tier) -> Material | None:
     attempt, verdict, query = search.attempt, search.verdict, search.query
     if attempt.where is Where.ONE_PLACE and verdict is not None and verdict.place is not None:
         return search.materials[search.found.index(verdict.chosen)].of_place(verdict.place, attempt.basis)
-    if attempt.where is Where.ANYWHERE and verdict is not None and _is_same_anywhere(search):
+    if attempt.where is Where.ANYWHERE and _is_same_anywhere(search):
         return None
     views = search.views.in_form(RasterForm(quarter_turns=round(attempt.angle_deg / 90)))
     found = _chosen(search, views, tier) if query.chooses else _named(search, views, tier)
@@ -105,7 +104,9 @@ def resembles_elsewhere(search: Search, found: Hypothesis, tier: Tier) -> bool:
 def _is_same_anywhere(search: Search) -> bool:
     """Whether the references that were chosen where soft priors say are those that would be chosen anywhere."""
     material = search.material
-    return material is not None and material.choice is not None and not _outside(search, material.choice)
+    if material is None or material.choice is None or material.basis != search.attempt.basis.but(where=Where.LIKELY):
+        return False
+    return not _outside(search, material.choice)
 
 
 def _outside(search: Search, choice: Choice) -> list[tuple[str, int]]:

@@ -29,8 +29,7 @@ def after_rejection(queries: Sequence[Query], outcome: Rejection) -> list[Query]
 
     Each photograph has climbed the other rungs by itself.
     """
-    from mapless_server.method.judge.attempt import Attempt, Where  # services need not load what computes
-    from mapless_server.method.judge.hypothesis import doubt_of
+    from mapless_server.method.judge.hypothesis import Attempt, Where, doubt_of  # services need not load what computes
     from mapless_server.method.ladder import Situation, further
 
     situation = Situation(may_be_elsewhere=any(it.chooses and it.narrowing.has_likely for it in queries))

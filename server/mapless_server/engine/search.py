@@ -8,13 +8,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from mapless_server.method.judge.attempt import Attempt, Where
-from mapless_server.method.judge.hypothesis import Hypothesis
+from mapless_server.method.features.views import Matches, PosedView, View
+from mapless_server.method.judge.hypothesis import Attempt, Hypothesis, Where
 from mapless_server.method.ladder import Situation, first_attempt
 from mapless_server.method.options import StageContext, Variant
+from mapless_server.method.rejection import PoseHypothesis
+from mapless_server.scenes import Choice
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
 from mapless_server.store import SceneAttributes
 
+from .photos import QueryViews
 from .query import PREPARE, REFINE, Query, ReferenceSource, Result, Tried
 
 if TYPE_CHECKING:  # services need not load what computes
@@ -24,9 +27,59 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.judge.hypothesis import Found
     from mapless_server.method.pipeline import Coarse, Prepared
 
-    from .material import Material
-    from .photos import QueryViews
     from .query import Tier
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A photograph and its references, described with the same features: what attempts of one basis are computed from.
+
+    Attributes:
+        basis: the basis of the attempts that it serves.
+        views: the photograph in their raster.
+        view: its features.
+        references: the references that are used, in order.
+        generation: generation of the scene when they were read.
+        choice: how they were chosen; None if the caller named them.
+        query_matches: matches of the photograph with each reference, if they were chosen by these.
+        is_strong: whether these are to be those of a network, as far as nearest neighbours find few.
+        unmatched: indices of the references that the network has still to match, each in a step of its own, so that a
+            busy server computes for other callers in between.
+    """
+
+    basis: Attempt
+    views: QueryViews
+    view: View
+    references: tuple[PosedView, ...]
+    generation: int
+    choice: Choice | None = None
+    query_matches: tuple[Matches, ...] | None = None
+    is_strong: bool = False
+    unmatched: tuple[int, ...] = ()
+
+    def serves(self, attempt: Attempt) -> bool:
+        """Whether an attempt is computed from it."""
+        return attempt.basis == self.basis and attempt.matching.is_strong == self.is_strong
+
+    @property
+    def is_searched(self) -> bool:
+        """Whether the scene has references to choose from."""
+        return self.choice is not None and bool(self.choice.descriptor)
+
+    @property
+    def missing(self) -> str:
+        """Says why there are no references."""
+        if self.choice is not None and self.choice.references:
+            return "what is stored of the references that resemble the photograph is damaged"
+        return "no reference is where the prior says" if self.is_searched else "the scene has no references"
+
+    def of_place(self, place: PoseHypothesis, basis: Attempt) -> Material:
+        """The same with the references of one place alone."""
+        kept = [i for i, it in enumerate(self.references) if it.name in place.references]
+        matches = None if self.query_matches is None else tuple(self.query_matches[i] for i in kept)
+        references = tuple(self.references[i] for i in kept)
+        return replace(self, basis=basis, references=references, query_matches=matches, is_strong=False, unmatched=())
+
 
 _COUNTS = (2, 5, 10, 20, 64)
 """Queries with about as many references cost about as much."""

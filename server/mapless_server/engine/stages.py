@@ -11,14 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from mapless_server.engine.search import Material
 from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method import ladder, pipeline
-from mapless_server.method import localize as method
 from mapless_server.method.bundle.estimate import Support
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.judge.attempt import Attempt, Raster, Solver, Where
 from mapless_server.method.judge.decide import decide
-from mapless_server.method.judge.hypothesis import Doubt, Found, Hypothesis, found_by
+from mapless_server.method.judge.hypothesis import Attempt, Doubt, Found, Hypothesis, Raster, Solver, Where, found_by
 from mapless_server.method.options import DoubtOptions, Variant
 from mapless_server.method.pipeline import Coarse, Prepared, tracked_support
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -38,7 +37,6 @@ from mapless_server.scheduling import (
 
 from . import choosing, tracking
 from .failures import failure_of
-from .material import Material
 from .photos import RasterForm
 from .query import COARSE, PREPARE, REFINE, TRACK, Result, Tier
 from .search import SKIPPED, Search, SearchJob, SearchResult, SearchStep
@@ -68,7 +66,7 @@ class Method:
     `tracked_support` makes the support that a photograph without a pose can still give to its rig or sequence.
     """
 
-    prepare: Callable[..., Prepared | Rejection] = method.prepare
+    prepare: Callable[..., Prepared | Rejection] = pipeline.prepare
     reconstruct: Callable[[Sequence[Prepared]], list[Coarse | Exception]] = pipeline.reconstruct
     solve: Callable[[Coarse, Attempt, DoubtOptions], Found] = solve
     coarse_answer: Callable[[Coarse], Answer | None] = pipeline.coarse_answer
@@ -272,7 +270,7 @@ class QueryStages:
             matches = tuple(matcher.match_quickly(view, references, context.check))
         material = Material(search.attempt.basis, views, view, references, generation, near, matches)
         given = view, references, self._verdicts.pipeline(search, tier)
-        prepared = method.prepare(*given, query.options, context, matches, query.priors)
+        prepared = pipeline.prepare(*given, query.options, context, matches, query.priors)
         if isinstance(prepared, Rejection):
             return None
         (coarse,) = pipeline.reconstruct([prepared])

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from mapless_server.engine.search import Material
 from mapless_server.method import ladder
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.judge.answer import Localization
-from mapless_server.method.judge.attempt import Attempt, Where
 from mapless_server.method.judge.hints import hinted
-from mapless_server.method.judge.hypothesis import Doubt, Found
+from mapless_server.method.judge.hypothesis import Attempt, Doubt, Found, Where
 from mapless_server.method.judge.judge import trust_in_scene
 from mapless_server.method.judge.references import supporters_of, with_contradiction, without_agreement
 from mapless_server.method.options import DoubtOptions
@@ -18,7 +18,6 @@ from mapless_server.scenes import ANYWHERE
 from mapless_server.store import SceneAttributes
 
 from . import tracking
-from .material import Material
 from .query import Result, Tier
 from .search import Search
 

@@ -7,8 +7,7 @@ to an attempt that was not tried yet; so after stronger features, or other refer
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 
-from .judge.attempt import Attempt, Raster, Solver, Where
-from .judge.hypothesis import Doubt
+from .judge.hypothesis import Attempt, Doubt, Raster, Solver, Where
 from .pairs.pair import Matching
 
 

@@ -9,18 +9,14 @@ from dataclasses import replace
 
 from . import ladder
 from .bundle.priors import NO_PRIORS, Priors
-from .features.views import Matches, PosedView, View
+from .features.views import PosedView, View
 from .judge.answer import Answer
-from .judge.attempt import Attempt
 from .judge.decide import decide
-from .judge.hypothesis import Found, Hypothesis
+from .judge.hypothesis import Attempt, Found, Hypothesis
 from .options import DoubtOptions, LocalizeOptions, StageContext, Variant
-from .pipeline import Coarse, Pipeline, Prepared, reconstruct
-from .rejection import Rejection, RejectionReason
+from .pipeline import Coarse, Pipeline, prepare, reconstruct
+from .rejection import Rejection
 from .solve import solve
-
-MIN_FEATURES = 12
-"""A photograph with fewer local features is blank, black or blurred."""
 
 
 def localize(
@@ -65,46 +61,3 @@ def refine(coarse: Coarse, doubt: DoubtOptions = DoubtOptions()) -> Answer:  # n
             seconds = dict(prepared.context.stage_seconds)
             return replace(verdict.chosen.answer, outcome=verdict.outcome, stage_seconds=seconds)
         attempt = following[1]
-
-
-def prepare(
-    query: View,
-    references: Sequence[PosedView],
-    pipeline: Pipeline,
-    options: LocalizeOptions,
-    context: StageContext,
-    query_matches: Sequence[Matches] | None = None,
-    priors: Priors = NO_PRIORS,
-    is_metric: bool = True,
-) -> Prepared | Rejection:
-    """Matches the query with its references, and these with one another; a rejection if that is impossible.
-
-    `query_matches` with each reference, if given, are used unchanged: the references were chosen by them.
-    `is_metric` is whether the unit of the references' poses is the metre. Raises ValueError if a view lacks input of
-    the coarse backend.
-    """
-    if not references:
-        return Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references")
-    if len(query.features) < MIN_FEATURES:
-        message = f"the photograph has {len(query.features)} local features, {MIN_FEATURES} are needed"
-        return Rejection(RejectionReason.LOW_TEXTURE, message)
-    origin = references[0].world_from_camera.translation
-    nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
-    bucket = pipeline.reconstructor.bucket(query, nearby)
-    with context.stage("correspond"):
-        correspondences = pipeline.matcher.correspond(
-            query, references, check=context.check, query_matches=query_matches
-        )
-    return Prepared(
-        query=query,
-        references=nearby,
-        references_in_world=tuple(references),
-        origin=origin,
-        pipeline=pipeline,
-        options=options,
-        correspondences=correspondences,
-        bucket=bucket,
-        context=context,
-        priors=priors.shifted(-origin),
-        is_metric=is_metric,
-    )

@@ -11,7 +11,7 @@ from enum import Enum
 
 from mapless_server.bounds import check_bounds
 
-from .bundle.unknowns import IntrinsicsSigma
+from .bundle.priors import IntrinsicsSigma
 
 
 class Variant(str, Enum):

@@ -16,7 +16,7 @@ from .bundle.priors import NO_PRIORS, Priors
 from .coarse import Outcome, Reconstructor, Request, Triangulation, reconstruct_one
 from .coarse.geometric import GeometricReconstructor, point_maps
 from .coarse.scale import ScaleOptions, estimate_scale, known_scale, network_scale
-from .features.views import PosedView, Reconstruction, View
+from .features.views import Matches, PosedView, Reconstruction, View
 from .judge.answer import Answer, Localization, shifted
 from .judge.judge import JudgeOptions
 from .options import LocalizeOptions, StageContext, Variant
@@ -24,13 +24,17 @@ from .pairs.correspond import Correspondences, Matcher
 from .pairs.pair import Matching
 from .pose.one_reference import OneReferenceOptions
 from .pose.pnp import PnpOptions
-from .rejection import Rejection
+from .rejection import Rejection, RejectionReason
 from .structure.kept_depth import with_kept_depths
 from .structure.match import PAPER_MATCH, MatchOptions, match_points, vote
 from .structure.model import MetricScale, PointMatches, Structure
 from .structure.structure import PAPER_STRUCTURE, StructureOptions, build_structure, triangulated_structure
 
 T = TypeVar("T")
+
+
+MIN_FEATURES = 12
+"""A photograph with fewer local features is blank, black or blurred."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +165,49 @@ class Coarse:
         stationary_count = prepared.correspondences.stationary_count
         made = Answer(outcome, scale, seconds, matches, inliers, support, stationary_count)
         return shifted(made, prepared.origin)
+
+
+def prepare(
+    query: View,
+    references: Sequence[PosedView],
+    pipeline: Pipeline,
+    options: LocalizeOptions,
+    context: StageContext,
+    query_matches: Sequence[Matches] | None = None,
+    priors: Priors = NO_PRIORS,
+    is_metric: bool = True,
+) -> Prepared | Rejection:
+    """Matches the query with its references, and these with one another; a rejection if that is impossible.
+
+    `query_matches` with each reference, if given, are used unchanged: the references were chosen by them.
+    `is_metric` is whether the unit of the references' poses is the metre. Raises ValueError if a view lacks input of
+    the coarse backend.
+    """
+    if not references:
+        return Rejection(RejectionReason.NO_USABLE_REFERENCES, "no references")
+    if len(query.features) < MIN_FEATURES:
+        message = f"the photograph has {len(query.features)} local features, {MIN_FEATURES} are needed"
+        return Rejection(RejectionReason.LOW_TEXTURE, message)
+    origin = references[0].world_from_camera.translation
+    nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
+    bucket = pipeline.reconstructor.bucket(query, nearby)
+    with context.stage("correspond"):
+        correspondences = pipeline.matcher.correspond(
+            query, references, check=context.check, query_matches=query_matches
+        )
+    return Prepared(
+        query=query,
+        references=nearby,
+        references_in_world=tuple(references),
+        origin=origin,
+        pipeline=pipeline,
+        options=options,
+        correspondences=correspondences,
+        bucket=bucket,
+        context=context,
+        priors=priors.shifted(-origin),
+        is_metric=is_metric,
+    )
 
 
 def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Exception]:

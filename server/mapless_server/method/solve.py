@@ -6,19 +6,17 @@ Where one reference is given the points are those of a network's depths; `Solver
 from dataclasses import replace
 
 from .bundle.adjust import adjust_pose, with_covariance
-from .bundle.estimate import PosedSupport, Support
+from .bundle.estimate import PosedSupport, Support, with_halves
 from .bundle.pose_problem import AdjustInput
 from .bundle.priors import NO_PRIORS
-from .bundle.radii import with_halves
 from .features.views import Reconstruction
 from .judge.answer import Answer, Localization
-from .judge.attempt import Attempt, Solver
+from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
-from .judge.fixed import unmoved_failure
-from .judge.hypothesis import Doubt, Found, found_by
-from .judge.intrinsics import intrinsics_checks
+from .judge.hypothesis import Attempt, Doubt, Found, Solver, found_by
 from .judge.judge import contradiction, judge
 from .judge.one_reference import one_reference_failure, trust_of_score
+from .judge.references import unmoved_failure
 from .judge.two_view import (
     lacks_distance,
     one_reference_rejection,

@@ -12,7 +12,7 @@ import numpy as np
 
 from mapless_server.errors import DataLoss
 from mapless_server.method.features.extractors import FeatureExtractor
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.options import StageContext
 from mapless_server.method.pairs.agreement import MAX_ERROR_PX

@@ -18,7 +18,7 @@ from mapless_server.images import ImageLimits
 from mapless_server.method.coarse import Reconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import FeatureExtractor, make_extractor
-from mapless_server.method.features.nearest import Arithmetic, fastest_arithmetic
+from mapless_server.method.features.matching import Arithmetic, fastest_arithmetic
 from mapless_server.method.pairs.correspond import Matcher, make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline

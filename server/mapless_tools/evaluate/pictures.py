@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, cross_matrix
 from mapless_server.images import decode_image
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.views import View
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress

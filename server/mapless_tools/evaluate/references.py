@@ -10,8 +10,7 @@ from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image, image_size
 from mapless_server.method.features.extractors import FeatureExtractor
-from mapless_server.method.features.matching import OPTIONS, CorrespondOptions
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import OPTIONS, CorrespondOptions, mutual_matches
 from mapless_server.method.features.views import PosedView, View
 from mapless_server.networks.weights import WeightsError
 from mapless_server.scenes.retrieval.ranking import spread_choice

@@ -40,8 +40,7 @@ from mapless_server.errors import DataLoss
 from mapless_server.images import decode_image, decode_mask
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
-from mapless_server.method.judge.attempt import Attempt
-from mapless_server.method.judge.hypothesis import Found, found_by
+from mapless_server.method.judge.hypothesis import Attempt, Found, found_by
 from mapless_server.method.options import DoubtOptions, StageContext
 from mapless_server.method.pipeline import Coarse, coarse_answer
 from mapless_server.method.solve import solve

@@ -14,7 +14,7 @@ from mapless.geometry import Camera, RigidTransform
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import FeatureExtractor, SiftExtractor, SiftOptions, make_extractor
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.localize import localize

@@ -12,8 +12,8 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.method.bundle.adjust import adjust_pose
 from mapless_server.method.bundle.bundle import BundleProblem
 from mapless_server.method.bundle.estimate import PoseEstimate
+from mapless_server.method.bundle.normal_equations import Bundle
 from mapless_server.method.bundle.pose_problem import AdjustInput, AdjustOptions, optimum, pose_problem
-from mapless_server.method.bundle.unknowns import Bundle
 from mapless_server.method.optim.optimize import MinimizeOptions, minimize
 from mapless_server.method.pose.pnp import PnpOptions, solve_pose
 from mapless_server.method.structure.model import PointMatches

@@ -9,8 +9,8 @@ from support.scenes import SceneOptions, make_scene, random_for
 from mapless.geometry import Array
 from mapless_server.method.bundle.bundle import BundleProblem
 from mapless_server.method.bundle.dispersion import LEAST_LEFT, Dispersion, disperse
+from mapless_server.method.bundle.normal_equations import Bundle
 from mapless_server.method.bundle.pose_problem import AdjustInput, AdjustOptions, pose_problem
-from mapless_server.method.bundle.unknowns import Bundle
 
 
 def planted(case: str, references: int = 4, points: int = 40) -> tuple[BundleProblem, Bundle]:

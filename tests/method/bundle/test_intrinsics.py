@@ -22,10 +22,9 @@ from mapless_server.method.bundle.intrinsics import (
     read_as,
 )
 from mapless_server.method.bundle.pose_problem import AdjustInput, AdjustOptions, pose_problem, with_intrinsics
-from mapless_server.method.bundle.unknowns import IntrinsicsSigma
+from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.features.views import undistort_pixels
-from mapless_server.method.judge.cameras import wrong_camera
-from mapless_server.method.judge.intrinsics import intrinsics_checks, wrong_intrinsics
+from mapless_server.method.judge.cameras import intrinsics_checks, wrong_camera, wrong_intrinsics
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.structure.model import PointMatches
 

@@ -29,7 +29,14 @@ from mapless_server.method.bundle.dispersion import (
     dispersed_covariance,
     scale_covariance,
 )
-from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage, Support
+from mapless_server.method.bundle.estimate import (
+    PosedSupport,
+    PoseEstimate,
+    PoseStage,
+    Support,
+    error_radii,
+    with_halves,
+)
 from mapless_server.method.bundle.pose_problem import (
     DRIFT_INFLATION,
     OWN_INFLATION,
@@ -41,9 +48,8 @@ from mapless_server.method.bundle.pose_problem import (
     most_probable,
     pose_errors,
 )
-from mapless_server.method.bundle.radii import error_radii, with_halves
 from mapless_server.method.judge.evidence import evidence_of, votes_of
-from mapless_server.method.optim.perturbation import (
+from mapless_server.method.optim.optimize import (
     motion_jacobian,
     moved,
     pose_hessian,

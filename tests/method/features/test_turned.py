@@ -8,7 +8,7 @@ from mapless.geometry import Camera
 from mapless.lenses import RadialTangential
 from mapless_server.method.features.extractors.sift import SiftExtractor
 from mapless_server.method.features.extractors.turned import extract_turned
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 
 LENS = RadialTangential(k1=0.05, k2=-0.02, p1=0.004, p2=-0.003)
 CAMERA = Camera(1280, 301, 1000.0, 1010.0, 650.0, 140.0, LENS)

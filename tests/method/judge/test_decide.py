@@ -9,15 +9,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
+from mapless_server.method.bundle.estimate import (
+    PoseEstimate,
+    PoseStage,
+    Support,
+    accuracy_from_covariance,
+    error_radii,
+)
 from mapless_server.method.bundle.priors import PositionPrior, Priors
-from mapless_server.method.bundle.radii import accuracy_from_covariance, error_radii
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.judge import decide as module
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.judge.attempt import Attempt, Raster, Solver, Where
 from mapless_server.method.judge.decide import CLEARLY_MORE, SAME_POSITION_M, SAME_SHARE, at_one_place, decide
-from mapless_server.method.judge.hypothesis import Doubt, Failed, Found, Hypothesis, doubts_of, found_by
+from mapless_server.method.judge.hypothesis import (
+    Attempt,
+    Doubt,
+    Failed,
+    Found,
+    Hypothesis,
+    Raster,
+    Solver,
+    Where,
+    doubts_of,
+    found_by,
+)
 from mapless_server.method.options import DoubtOptions
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.rejection import (

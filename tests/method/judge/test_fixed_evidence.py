@@ -11,7 +11,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage, Support
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import Features, PosedView, View
-from mapless_server.method.judge.fixed import moved_matches, unmoved_failure
+from mapless_server.method.judge.references import moved_matches, unmoved_failure
 from mapless_server.method.pairs.stationary import StationaryOptions, show_same_view, stationary_matches
 from mapless_server.method.structure.model import PointMatches, Structure
 from mapless_server.method.structure.observations import FIRST_GUESS

@@ -25,7 +25,7 @@ from mapless_server.method.judge.evidence import (
     votes_of,
 )
 from mapless_server.method.judge.judge import JudgeOptions, judge, trust_of
-from mapless_server.method.optim.perturbation import pose_jacobian
+from mapless_server.method.optim.optimize import pose_jacobian
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pose.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason

@@ -12,10 +12,16 @@ from support.planted import AnyRatio, same_points
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.features import matching, nearest
+from mapless_server.method.features import matching
 from mapless_server.method.features.extractors import FEATURES
-from mapless_server.method.features.matching import OPTIONS, CorrespondOptions, SharedThreads, StoredPair
-from mapless_server.method.features.nearest import best_of_both, mutual_matches
+from mapless_server.method.features.matching import (
+    OPTIONS,
+    CorrespondOptions,
+    SharedThreads,
+    StoredPair,
+    best_of_both,
+    mutual_matches,
+)
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.pairs import pair as reference_pairs
 from mapless_server.method.pairs.correspond import Matcher, make_matcher
@@ -74,7 +80,7 @@ def test_mutual_matches_equal_brute_force(n: int, m: int, noise: float, ratio: f
 def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
     """To the last bit, since sums of up to 127^2 64 are exact as float32; largest numbers included."""
     pytest.importorskip("torch", reason="the networks extra is not installed")
-    if not nearest.has_exact_products():
+    if not matching.has_exact_products():
         pytest.skip("the processor has no products of int8 that do not saturate")
     random = random_for("whole", n, m)
     first, second = (
@@ -84,11 +90,11 @@ def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
     first.descriptors[0] = second.descriptors[-1] = 127
     a, b = (it.descriptors.astype(np.float32) for it in (first, second))
     expected = a @ b.T * second.inverse_lengths * first.inverse_lengths[:, None]
-    blocks = [block.copy() for block in nearest.cosine_blocks(first, second, nearest.Arithmetic.INT8)]
+    blocks = [block.copy() for block in matching.cosine_blocks(first, second, matching.Arithmetic.INT8)]
     assert np.concatenate(blocks).tobytes() == expected.tobytes()
     plain = first.unit_descriptors() @ second.unit_descriptors().T
     for either in (False, True):
-        matches = mutual_matches(first, second, 0.99, either, nearest.Arithmetic.INT8)
+        matches = mutual_matches(first, second, 0.99, either, matching.Arithmetic.INT8)
         assert matches.tolist() == best_of_both(plain.copy(), 0.99, either=either).tolist()
 
 
@@ -236,7 +242,7 @@ def matched_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Features, Featu
         return compare
 
     for module, name in (reference_pairs, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
-        monkeypatch.setattr(module, name, spy(getattr(nearest, name)))
+        monkeypatch.setattr(module, name, spy(getattr(matching, name)))
     return calls
 
 

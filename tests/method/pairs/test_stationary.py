@@ -12,7 +12,7 @@ from support.scenes import CAMERA, SceneOptions, look_at, make_scene, random_for
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.extractors import SiftExtractor
-from mapless_server.method.features.nearest import mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.views import Features, PosedView, View
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.localize import localize

@@ -10,7 +10,7 @@ import pytest
 from support.scenes import random_for
 
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
-from mapless_server.method.bundle.radii import accuracy_from_covariance
+from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.coarse import Outcome, Request
 from mapless_server.method.features.views import Features, Matches, PosedView, ReconstructedView, Reconstruction, View
 from mapless_server.method.judge.answer import Answer, Localization

@@ -17,8 +17,7 @@ from mapless_server.method.bundle.adjust import adjust_pose
 from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage
 from mapless_server.method.bundle.pose_problem import AdjustInput, AdjustOptions, pose_problem
 from mapless_server.method.bundle.priors import NO_PRIORS, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
-from mapless_server.method.optim.optimize import MinimizeOptions
-from mapless_server.method.optim.perturbation import moved
+from mapless_server.method.optim.optimize import MinimizeOptions, moved
 from mapless_server.method.pose import with_priors as informed
 from mapless_server.method.pose.pnp import PnpOptions, solve_pose
 from mapless_server.method.pose.with_priors import ransac_with_gravity, refine_pose, solve_pairs

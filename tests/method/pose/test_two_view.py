@@ -15,8 +15,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.bundle.dispersion import UncertaintyOptions
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.bundle.pose_problem import AdjustOptions
-from mapless_server.method.bundle.priors import PosePrior, Priors
-from mapless_server.method.bundle.unknowns import IntrinsicsSigma
+from mapless_server.method.bundle.priors import IntrinsicsSigma, PosePrior, Priors
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.judge.answer import Localization
@@ -29,7 +28,7 @@ from mapless_server.method.judge.two_view import (
     two_view_trust,
 )
 from mapless_server.method.localize import localize
-from mapless_server.method.optim.perturbation import moved, rotation_vector
+from mapless_server.method.optim.optimize import moved, rotation_vector
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pairs.correspond import Correspondences, Matcher
 from mapless_server.method.pairs.epipolar import sampson_px

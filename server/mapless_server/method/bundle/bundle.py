@@ -21,14 +21,12 @@ from mapless.geometry import Array
 
 from ..features.tracks import Tracks
 from ..features.views import PosedView
-from ..optim.optimize import cauchy_cost, solve_step
-from ..optim.perturbation import world_jacobian
+from ..optim.optimize import cauchy_cost, solve_step, world_jacobian
 from ..structure.model import DepthPlanes, Structure
 from ..structure.observations import Observations
 from ..structure.structure import observe
-from .normal_equations import Linearized, NormalEquations, ViewColumns
+from .normal_equations import Bundle, Linearized, NormalEquations, Poses, ViewColumns
 from .priors import NO_PRIORS, Priors
-from .unknowns import Bundle, Poses
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """The covariance of a pose.
 
-The answer's covariance is that of world_from_camera in ROS's order (see `perturbation`), and is the sum of
+The answer's covariance is that of world_from_camera in ROS's order (see `optimize`), and is the sum of
 
     references   the dispersion of the poses that leave out one reference each: errors of reference poses, lens models
                  and shutters, which all points of a reference share.
@@ -77,13 +77,11 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 
 from ..features.tracks import summed
-from ..optim.optimize import cauchy_weight, take
-from ..optim.perturbation import world_jacobian
+from ..optim.optimize import cauchy_weight, take, world_jacobian
 from .bundle import BundleProblem
+from .estimate import SUPPORTING_SHARE, gap_ratio
 from .intrinsics import IntrinsicsEquations
-from .normal_equations import EliminatedPoints, ViewColumns
-from .radii import SUPPORTING_SHARE, gap_ratio
-from .unknowns import Bundle
+from .normal_equations import Bundle, EliminatedPoints, ViewColumns
 
 
 @dataclass(frozen=True)

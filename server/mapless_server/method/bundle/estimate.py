@@ -1,4 +1,7 @@
-"""A pose and its support: data between the estimators and the judge."""
+"""A pose and its support: data between the estimators and the judge.
+
+Radii of a pose, which errors do not exceed with a given probability; growth of errors with the distance.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,17 @@ from mapless.geometry import Array, RigidTransform
 
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..structure.model import PointMatches, Structure
-from .priors import PriorCheck
-from .unknowns import IntrinsicsSigma
+from .priors import IntrinsicsSigma, PriorCheck
 
 if TYPE_CHECKING:  # services do not load what computes
     from .intrinsics import IntrinsicsEvidence
+
+
+import math
+from dataclasses import replace
+
+from numpy.typing import ArrayLike
+from scipy.special import gammaincinv
 
 
 class PoseStage(str, Enum):
@@ -150,3 +159,143 @@ class PosedSupport(Support):
         if self.two_view is not None:
             seen = np.concatenate([seen, self.two_view.reference[self.two_view.inliers]])
         return tuple(np.bincount(seen, minlength=len(self.references)).tolist())
+
+
+TAIL_95 = 1.47
+"""Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Measured once (server/research)."""
+
+
+SELF_TAIL_95 = 1.3
+"""The same for answers of a scene that is calibrated: the other one has to cover that scenes differ."""
+
+TAIL_PRIOR = 5.0
+"""Number of a calibration's answers at which the factor is half-way between the two."""
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Radii: errors not exceeded in 68 and 95 % of cases."""
+
+    position_68_m: float
+    position_95_m: float
+    rotation_68_deg: float
+    rotation_95_deg: float
+
+
+def accuracy_from_covariance(covariance: Array) -> Accuracy:
+    """Radii of a pose's covariance (6, 6): order x y z rx ry rz, metres and radians."""
+    shares = np.array([0.68, 0.95])
+    position_68_m, position_95_m = error_radii(covariance[:3, :3], shares).tolist()
+    rotation_68, rotation_95 = error_radii(covariance[3:, 3:], shares).tolist()
+    return Accuracy(
+        position_68_m=position_68_m,
+        position_95_m=TAIL_95 * position_95_m,
+        rotation_68_deg=math.degrees(rotation_68),
+        rotation_95_deg=TAIL_95 * math.degrees(rotation_95),
+    )
+
+
+def self_tail(count: int) -> float:
+    """Factor on the radius of 95 % in a scene that is calibrated by so many answers to its references."""
+    return float(TAIL_95 * (SELF_TAIL_95 / TAIL_95) ** (count / (count + TAIL_PRIOR)))
+
+
+JACKKNIFE_SHARE = 0.6
+"""Of the jackknife's variance where halves count, too; alone it has to contain all of the errors. Of 32
+places, each left out, the others choose 0.5 or 0.6 (20 and 12); planted noise of reference poses requires 0.56."""
+
+MOST_DISAGREEMENT = 3.0
+"""Of half of the distance between halves, in 68 % radii by the jackknife, so that these grow at most 3.2-fold. Halves
+further apart have failed, one of them at least, and how far says nothing any more."""
+
+
+def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
+    """An estimate whose radii contain, too, that the cameras by halves of its data are `apart_m` from each other.
+
+    Two independent halves have twice the variance of both together each, so their cameras are two standard deviations
+    apart, and the square of half of the distance estimates the variance. The jackknife is linear at the pose, and does
+    not see how far halves move that fit as well elsewhere, as with a narrow view of something far, where turning and
+    stepping aside look alike. The distance of a few splits varies, and shows no errors of reference poses that all
+    references share, so a share of the jackknife's variance is added. Turning belongs to stepping aside, so the whole
+    covariance is multiplied. Errors of the intrinsics are the same in both halves, so they count in full. Halves know
+    nothing of priors: an estimate with these stays as it is.
+    """
+    radius_m = accuracy_from_covariance(estimate.covariance).position_68_m
+    if estimate.without_priors is not None or not radius_m > 0:
+        return estimate
+    in_radii = min(apart_m / 2 / radius_m, MOST_DISAGREEMENT)
+    covariance = (JACKKNIFE_SHARE + in_radii**2) * estimate.covariance + (1 - JACKKNIFE_SHARE) * _shared(estimate)
+    return replace(estimate, covariance=covariance)
+
+
+def _shared(estimate: PoseEstimate) -> Array:
+    """The part (6, 6) of the covariance by errors of the intrinsics, which are the same in all halves of the data.
+
+    Evidence that was estimated anew, because it contradicts the intrinsics, says more than the covariance contains: no
+    more than this counts, of position and rotation.
+    """
+    if estimate.intrinsics is None:
+        return np.zeros((6, 6))
+    found, total = estimate.intrinsics.pose_covariance, estimate.covariance
+    least = max(1.0, *(np.trace(found[part, part]) / np.trace(total[part, part]) for part in (slice(3), slice(3, 6))))
+    return np.asarray(found / least)
+
+
+def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
+    """Lengths (P,) that a zero-mean normal vector of covariance (n, n) does not exceed with probabilities (P,).
+
+    The squared length is a sum of chi-squares weighted by the eigenvalues, approximated by one scaled chi-square with
+    the same mean and variance (Satterthwaite). Exact if all eigenvalues are equal or all but one vanish, else within
+    4 %.
+    """
+    probabilities = np.asarray(probabilities, float)
+    eigenvalues = np.linalg.eigvalsh(covariance).clip(min=0)
+    total = float(eigenvalues.sum())
+    if total <= 0:
+        return np.zeros(len(probabilities))
+    scale = float((eigenvalues**2).sum()) / total
+    degrees_of_freedom = total / scale
+    return np.asarray(np.sqrt(2 * scale * gammaincinv(degrees_of_freedom / 2, probabilities)), float)
+
+
+GROWTH = 0.2
+"""Exponent of the gap in the ratio of errors to radii, which contain 0.1 of it; measured once (server/research)."""
+
+USUAL_GAP = 0.1
+"""The gap at which factors are stated."""
+
+LEAST_GAP, LARGEST_GAP = 0.03, 0.5
+"""Beyond these, radii do not change with the gap."""
+
+SMALLEST_GAP = 0.01
+"""Below, the ratio of errors to radii does not change either: references that are left out of a film of a hall are at
+0.05, its photographs at 0.01 of what they see, and their ratios differ by 1.6."""
+
+SUPPORTING_SHARE = 0.1
+"""References with fewer inliers, by those of the one with the most, do not hold the pose."""
+
+
+def viewpoint_gap(support: PosedSupport) -> tuple[float, float]:
+    """Distance to the nearest reference that holds the pose, over the median depth of the inliers; and that depth.
+
+    ValueError if there is no estimate.
+    """
+    pose, counts = support.estimate.world_from_camera, np.array(support.inliers_by_reference())
+    points = [support.structure.x_in_world[support.matches.point[support.estimate.inliers]]]
+    if support.two_view is not None:
+        points.append(support.two_view.x_in_world[support.two_view.inliers])
+    depth = pose.inverse().apply(np.concatenate(points))[:, 2]
+    depth_m = max(float(np.nanmedian(depth)) if len(depth) else 0.0, np.finfo(float).tiny)
+    holding = np.flatnonzero(counts >= SUPPORTING_SHARE * counts.max())
+    centres = np.array([support.references[i].world_from_camera.translation for i in holding])
+    return float(np.linalg.norm(centres - pose.translation, axis=1).min()) / depth_m, depth_m
+
+
+def gap_ratio(gap: float) -> float:
+    """The gap by the usual one, within the bounds."""
+    return float(np.clip(gap, LEAST_GAP, LARGEST_GAP)) / USUAL_GAP
+
+
+def growth(gap: float) -> float:
+    """Ratio of errors to radii at a gap, relative to that at the usual gap; of positions and of angles."""
+    return float((np.clip(gap, SMALLEST_GAP, LARGEST_GAP) / USUAL_GAP) ** GROWTH)

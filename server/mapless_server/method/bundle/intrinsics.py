@@ -27,7 +27,7 @@ from mapless.lenses import Distortion, RadialTangential
 from mapless_server.bounds import check_bounds
 
 from ..features.views import View, undistort_pixels
-from .unknowns import IntrinsicsSigma
+from .priors import IntrinsicsSigma
 
 PRINCIPAL = (1, 2)
 """Which of the four errors are those of the principal point."""

@@ -37,8 +37,7 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 
 from ..features.views import Matches, PosedView, View
-from ..optim.optimize import MinimizeOptions, minimize
-from ..optim.perturbation import world_jacobian
+from ..optim.optimize import MinimizeOptions, minimize, world_jacobian
 from ..structure.model import PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, bundle_of
@@ -51,8 +50,8 @@ from .intrinsics import (
     intrinsics_evidence,
     keypoint_motion,
 )
-from .normal_equations import Linearized, NormalEquations
-from .unknowns import Bundle, IntrinsicsSigma, Poses
+from .normal_equations import Bundle, Linearized, NormalEquations, Poses
+from .priors import IntrinsicsSigma
 
 LEAST_DAMPING = 1e-9
 """Keeps the points determined where they are eliminated at the given poses."""

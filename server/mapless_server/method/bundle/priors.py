@@ -22,9 +22,10 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import chdtri
 
-from mapless.geometry import Array, RigidTransform, cross_matrix
+from mapless.geometry import Array, Camera, RigidTransform, cross_matrix
+from mapless_server.bounds import check_bounds
 
-from ..optim.perturbation import rotation_vector
+from ..optim.optimize import rotation_vector
 
 CONFLICT_PROBABILITY = 1e-4
 """Probability that a consistent prior is taken for one in conflict."""
@@ -47,6 +48,30 @@ class PriorKind(str, Enum):
     HEADING = "heading"
     GRAVITY = "gravity"
     POSE = "pose"
+
+
+@dataclass(frozen=True)
+class IntrinsicsSigma:
+    """Standard deviations of a photograph's intrinsics.
+
+    Attributes:
+        focal_share: of both focal lengths together, as a share of them. Lenses change by this much with focus and
+            temperature, and calibrations are not more repeatable.
+        principal_share: of each coordinate of the principal point, as a share of the image's width.
+        k1: of the first radial coefficient.
+    """
+
+    focal_share: float = 0.003
+    principal_share: float = 0.003
+    k1: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "focal_share principal_share k1", above=0, at_most=1)
+
+    def of(self, camera: Camera) -> Array:
+        """Standard deviations (4,) of s, of the principal point in pixels of this camera, and of k1."""
+        principal_px = self.principal_share * camera.width_px
+        return np.array([self.focal_share, principal_px, principal_px, self.k1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,7 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
-from ..optim.optimize import switched_cost, switched_weight
-from ..optim.perturbation import perturbed, rotation_vector
+from ..optim.optimize import perturbed, rotation_vector, switched_cost, switched_weight
 
 _MEDIAN_SQUARE = 5.35
 """Median of a chi-square of six degrees of freedom."""

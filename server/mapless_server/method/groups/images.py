@@ -18,7 +18,7 @@ from ..bundle.priors import NO_PRIORS, Priors
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..judge.answer import Answer, Localization
 from ..judge.evidence import findable_count, hull_share
-from ..judge.fixed import moved_matches, without
+from ..judge.references import moved_matches, without
 from ..pairs.stationary import StationaryOptions
 from ..pose.generalized import CameraMatches
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms
@@ -123,7 +123,7 @@ class PosedImage:
         return tuple(np.bincount(seen, minlength=count).tolist())
 
     def moved(self) -> PosedImage:
-        """Without matches at the same pixels as in the references, see `judge.fixed`."""
+        """Without matches at the same pixels as in the references, see `judge.references`."""
         it = self.source
         given = it.query, it.references, it.structure, self.matches, it.query_matches
         kept = moved_matches(*given, StationaryOptions())

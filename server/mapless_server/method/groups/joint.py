@@ -17,8 +17,7 @@ from typing import Generic
 from mapless.geometry import Array
 
 from ..bundle.priors import PriorCheck, Priors
-from ..optim.optimize import MinimizeOptions, minimize
-from ..optim.perturbation import covariance_in_world
+from ..optim.optimize import MinimizeOptions, covariance_in_world, minimize
 from ..structure.model import PointMatches
 from .images import MatchedImage, PosedImage
 from .problem import ADJUST, GroupProblem, GroupState, S

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.bundle import BundleProblem, bundle_of
-from ..bundle.normal_equations import Linearized, NormalEquations
+from ..bundle.normal_equations import Bundle, Linearized, NormalEquations, Poses
 from ..bundle.pose_problem import LEAST_DAMPING, AdjustOptions, most_probable, pose_errors
 from ..bundle.priors import Priors
-from ..bundle.unknowns import Bundle, Poses
 from ..features.tracks import Tracks
 from ..features.views import PosedView
-from ..optim.optimize import solve_step
-from ..optim.perturbation import world_jacobian
+from ..optim.optimize import solve_step, world_jacobian
 from ..structure.model import PointMatches
 from ..structure.structure import tracks_with_query
 from .images import MatchedImage

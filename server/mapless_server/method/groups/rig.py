@@ -12,7 +12,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
 from ..bundle.priors import PriorCheck
-from ..optim.perturbation import covariance_in_world, perturbed
+from ..optim.optimize import covariance_in_world, perturbed
 from ..pose.generalized import inlier_count, rig_ransac
 from ..pose.pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason

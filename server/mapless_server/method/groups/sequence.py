@@ -21,7 +21,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import PriorCheck, Priors
 from ..judge.evidence import findable_count
-from ..optim.perturbation import covariance_in_world
+from ..optim.optimize import covariance_in_world
 from ..rejection import Rejection, RejectionReason
 from .drift import SequenceState, world_from_session_at
 from .images import (

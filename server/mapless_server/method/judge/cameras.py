@@ -6,26 +6,111 @@ and these alone do not contradict it. But with a camera that is nearer to the tr
 with one pose. So poses are computed with other focal lengths, with other values of k1 and without the lens, and, where
 these are unusual, with the principal point in the centre and with square pixels; the score of `two_view.pose` compares
 them, by points and by matches without points together. That costs a query nothing of which the linear check is certain.
+
+Checks of a photograph's intrinsics against its matches.
+
+Cropped, resized and undistorted photographs often come with the intrinsics of another image. The pose is then off, with
+small residuals: its motion absorbs most of such an error. What it does not absorb is in the normal equations of the
+adjustment (see `intrinsics`), with standard deviations that contain errors of points and reference poses. A parameter
+that is off by more than the prior and these standard deviations allow together is a reason to reject the pose, although
+it was estimated with the photograph's value: the camera's next photograph will have the same error.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless.lenses import Fisheye
+from mapless.lenses import Distortion, Fisheye
 
 from ..bundle.estimate import PosedSupport
-from ..bundle.intrinsics import IntrinsicsEvidence, corrected, read_as
-from ..bundle.unknowns import IntrinsicsSigma
+from ..bundle.intrinsics import ContradictionOptions, IntrinsicsEvidence, corrected, read_as
+from ..bundle.priors import IntrinsicsSigma
 from ..features.views import View
 from ..pose.pnp import PnpOptions, ransac
 from ..pose.relative import Evidence, RelativePoseOptions, find_pose, score
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
-from .intrinsics import advice_for
+
+
+def intrinsics_checks(evidence: IntrinsicsEvidence, options: ContradictionOptions) -> tuple[IntrinsicsCheck, ...]:
+    """The checks of all parameters, in pixels of the photograph as it was sent."""
+    sent, scale = evidence.sent, evidence.sent.width_px / evidence.given.width_px
+    k1 = sent.distortion.k1 if sent.distortion else 0.0
+    given = np.array([sent.focal_x_px, sent.principal_x_px, sent.principal_y_px, k1])
+    unit = np.array([sent.focal_x_px, scale, scale, 1.0])
+    change = unit * evidence.value
+    change[0] = sent.focal_x_px * np.expm1(evidence.value[0])
+    estimated, sigma, given_sigma = given + change, unit * evidence.sigma, unit * evidence.prior_sigma
+    conflict, used = evidence.contradicted(options, evidence.prior_sigma), evidence.removed != 0
+    return tuple(
+        IntrinsicsCheck(
+            parameter,
+            given=float(given[i]),
+            estimated=float(estimated[i]),
+            estimated_sigma=float(sigma[i]),
+            given_sigma=float(given_sigma[i]),
+            conflict=bool(conflict[i]),
+            used=bool(used[i]),
+        )
+        for i, parameter in enumerate(IntrinsicsParameter)
+    )
+
+
+def wrong_intrinsics(
+    evidence: IntrinsicsEvidence, best_reference: str, options: ContradictionOptions
+) -> Rejection | None:
+    """A rejection that names each parameter in conflict, the most significant first; None if there is none."""
+    checks = intrinsics_checks(evidence, options)
+    wrong = sorted(
+        (it for it in checks if it.conflict), key=lambda it: -abs(it.estimated - it.given) / it.estimated_sigma
+    )
+    if not wrong:
+        return None
+    message = "; ".join(_sentence(it) for it in wrong)
+    hint = Hint("judge", Advice.CHECK_CALIBRATION, advice_for(evidence.sent.distortion, wrong), best_reference)
+    return Rejection(RejectionReason.GATE, message, hint, intrinsics_checks=checks)
+
+
+def _sentence(check: IntrinsicsCheck) -> str:
+    name, digits = check.parameter.field, 3 if check.parameter is IntrinsicsParameter.K1 else 1
+    return (
+        f"{name} is {check.given:.{digits}f}, the photograph says {check.estimated:.{digits}f} +- "
+        f"{check.estimated_sigma:.{digits}f}"
+    )
+
+
+def advice_for(lens: Distortion | None, wrong: Sequence[IntrinsicsCheck]) -> str:
+    """What to check, in words, of a camera with this lens of which these parameters are wrong."""
+    found = {it.parameter: it for it in wrong}
+    radial = found.get(IntrinsicsParameter.K1)
+    if radial is not None and lens == Fisheye():
+        return (
+            f"The camera is given as a fisheye without coefficients: the photograph says k1 = {radial.estimated:.2f}. "
+            "Give the lens's coefficients, or no fisheye for a photograph that is undistorted already."
+        )
+    if radial is not None and not lens:
+        return (
+            f"The camera is given without lens distortion: the photograph says k1 = {radial.estimated:.2f}. Give the "
+            "lens's coefficients, or undistort the photograph."
+        )
+    if radial is not None:
+        return (
+            "Check the photograph's lens distortion: the model, the order of its coefficients, and whether the "
+            "photograph is undistorted already."
+        )
+    if IntrinsicsParameter.FOCAL_LENGTH in found:
+        return (
+            "Check the photograph's focal length: intrinsics belong to one image size, change with it when a "
+            "photograph is resized, and have another principal point when it is cropped."
+        )
+    return (
+        "Check the photograph's principal point: it is in pixels from the centre of the top-left one, x first, and "
+        "moves when a photograph is cropped, resized or rotated."
+    )
+
 
 DOUBTED_SIGMAS = 3.0
 """Other cameras are tried if the linear check finds a parameter off by more standard deviations,"""

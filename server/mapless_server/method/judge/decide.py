@@ -19,17 +19,15 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 
-from ..bundle.estimate import Support
+from ..bundle.estimate import Support, accuracy_from_covariance
 from ..bundle.priors import Priors
-from ..bundle.radii import accuracy_from_covariance
 from ..pose import relative
 from ..pose.relative import RelativePoseOptions
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .answer import Localization
-from .attempt import Raster
 from .evidence import Votes, votes_of
-from .hypothesis import Doubt, Failed, Found, Hypothesis
+from .hypothesis import Doubt, Failed, Found, Hypothesis, Raster
 
 SAME_POSITION_M, SAME_ROTATION_DEG = 0.1, 2.0
 """Poses closer than this are one place. Radii do not include errors of the references' poses, so they can be too small

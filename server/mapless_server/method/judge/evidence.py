@@ -23,8 +23,7 @@ from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import PosedSupport, Support
 from ..features.views import Matches, PosedView, View
-from ..optim.optimize import cauchy_weight
-from ..optim.perturbation import pose_jacobian
+from ..optim.optimize import cauchy_weight, pose_jacobian
 from ..pose.pnp import PnpOptions, ransac
 from ..pose.two_view_matches import TwoViewMatches
 from ..structure.model import PixelPoints, PointMatches, Structure

@@ -39,16 +39,14 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
 from mapless_server.bounds import check_bounds
 
-from ..bundle.estimate import PosedSupport
+from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance
 from ..bundle.intrinsics import ContradictionOptions
-from ..bundle.radii import Accuracy, accuracy_from_covariance
 from ..features.views import Matches
-from ..optim.perturbation import pose_hessian, world_covariance
+from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.pnp import PnpOptions, false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
-from .cameras import wrong_camera
+from .cameras import wrong_camera, wrong_intrinsics
 from .evidence import Evidence, Votes, evidence_of, votes_of
-from .intrinsics import wrong_intrinsics
 from .references import disagreeing_references, supporters_of
 
 RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10

@@ -27,7 +27,7 @@ from ..pose.relative import band_chance, disc_chance
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .evidence import hull_px2
-from .fixed import moved_matches
+from .references import moved_matches
 
 MAX_LOG10_POSE = -15.0
 """Largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with references of other

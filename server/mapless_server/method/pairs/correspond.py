@@ -6,6 +6,8 @@ slow, it matches only the references with the most matches again, and pairs of r
 `PairMatching`.
 
 How two photographs are matched is in `matching`.
+
+Matches without those of what is fixed to the camera. What depends on the references alone is cached for them.
 """
 
 import time
@@ -14,21 +16,125 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mapless_server.cache import LruCache
 
 from ..features.matching import (
     OPTIONS,
+    Arithmetic,
     CorrespondOptions,
     NearestNeighbours,
     PairMatching,
     QueryMatching,
     SharedThreads,
 )
-from ..features.nearest import Arithmetic
+from ..features.tracks import keypoint_offsets
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from .pair import Matching, PairKey, PairMatches, ReferencePairs, in_order
-from .stationary import StationaryOptions
-from .stationary_filter import references_without_fixed, without_fixed
+from .stationary import IgnoredKeypoints, StationaryOptions, without_ignored
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencesWithoutFixed:
+    """References, in whatever order, without what is fixed to their cameras.
+
+    Attributes:
+        ignored: parts of the images; false if nothing is fixed.
+        of_reference: which keypoints (N,) are ignored, by the reference's key.
+        pairs: the agreeing matches of pairs without ignored keypoints, by the keys of both references.
+    """
+
+    ignored: IgnoredKeypoints
+    of_reference: Mapping[str, NDArray[np.bool_]]
+    pairs: Mapping[tuple[str, str], Matches]
+
+    @classmethod
+    def of(
+        cls,
+        references: Sequence[PosedView],
+        pairs: Mapping[tuple[int, int], PairMatches],
+        options: StationaryOptions,
+    ) -> "ReferencesWithoutFixed":
+        """Finds it by the matches of the pairs, by the references' indices."""
+        ignored = IgnoredKeypoints(references, {pair: it.stationary for pair, it in pairs.items()}, options)
+        if not ignored:
+            return cls(ignored, {}, {})
+        masks = [ignored.of(it.view) for it in references]
+        # All pairs at once, which takes a fraction of the time.
+        counts = [len(it.agreeing) for it in pairs.values()]
+        matches = np.concatenate([it.agreeing for it in pairs.values()])
+        begin = np.repeat(keypoint_offsets(references)[np.array(list(pairs))], counts, axis=0)
+        kept = ~np.concatenate(masks)[matches + begin].any(axis=1)
+        ends = np.concatenate([[0], np.cumsum(kept)])[np.cumsum(counts)]
+        names = [(references[i].key, references[j].key) for i, j in pairs]
+        of_pairs = zip(names, np.split(matches[kept], ends[:-1]), strict=True)
+        return cls(ignored, {it.key: mask for it, mask in zip(references, masks, strict=True)}, dict(of_pairs))
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory of the arrays, bytes; at least one."""
+        arrays = [*self.of_reference.values(), *self.pairs.values()]
+        return 1 + self.ignored.size_bytes + sum(it.nbytes for it in arrays)
+
+    def pair(self, first: PosedView, second: PosedView) -> Matches:
+        """The matches of two of the references, in this order."""
+        found = self.pairs.get((first.key, second.key))
+        return self.pairs[second.key, first.key][:, ::-1] if found is None else found
+
+
+def references_without_fixed(
+    references: Sequence[PosedView],
+    pairs: Mapping[tuple[int, int], PairMatches],
+    keys: frozenset[PairKey],
+    options: StationaryOptions,
+    cache: LruCache[object],
+) -> ReferencesWithoutFixed | None:
+    """Finds what is fixed to the cameras of references; None where no pair shows anything.
+
+    Args:
+        references: the references.
+        pairs: their matches, by the references' indices.
+        keys: the pairs' keys, which determine their matches.
+        options: options of finding it.
+        cache: by the references' keys and what else the results depend on.
+    """
+    if not any(len(it.stationary) for it in pairs.values()):
+        return None
+    key = tuple(sorted(it.key for it in references)), keys, options
+    found = cache.get(key)
+    if not isinstance(found, ReferencesWithoutFixed):
+        found = ReferencesWithoutFixed.of(references, pairs, options)
+        cache.put(key, found, found.size_bytes)
+    return found
+
+
+def without_fixed(
+    query: View,
+    references: Sequence[PosedView],
+    pairs: Mapping[tuple[int, int], PairMatches],
+    query_matches: Sequence[Matches],
+    fixed: ReferencesWithoutFixed | None,
+) -> tuple[dict[tuple[int, int], Matches], tuple[Matches, ...], int]:
+    """The matches of pairs, and of a query with each reference, without keypoints that are fixed to the camera.
+
+    The third result is the number of the query's keypoints whose matches are left out.
+    """
+    if fixed is None or not fixed.ignored:
+        return {pair: it.agreeing for pair, it in pairs.items()}, tuple(query_matches), 0
+    of_pairs = {(i, j): fixed.pair(references[i], references[j]) for i, j in pairs}
+    of_query = fixed.ignored.of(query)
+    kept = tuple(
+        without_ignored(it, of_query, fixed.of_reference[reference.key])
+        for it, reference in zip(query_matches, references, strict=True)
+    )
+    before, after = np.zeros(len(of_query), bool), np.zeros(len(of_query), bool)
+    for matches, left in zip(query_matches, kept, strict=True):
+        before[matches[:, 0]] = True
+        after[left[:, 0]] = True
+    return of_pairs, kept, int(before.sum() - after.sum())
+
 
 _PAIRS_THAT_COUNT = 10
 """For `Matcher.pair_s`, about."""

@@ -25,7 +25,7 @@ from ..bundle.dispersion import scale_covariance
 from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, Reconstruction, View
-from ..optim.perturbation import motion_jacobian, perturbed, world_covariance
+from ..optim.optimize import motion_jacobian, perturbed, world_covariance
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import MetricScale, PixelPoints, PointMatches, Structure
@@ -81,7 +81,7 @@ class Found:
     Attributes:
         support: support with the estimate; its points have their predicted depths.
         score: the larger, the less likely are so many inliers among wrong matches.
-        moved_score: the same for those matches that are at other pixels than in the reference; see `judge.fixed`.
+        moved_score: the same for those matches that are at other pixels than in the reference; see `judge.references`.
     """
 
     support: PosedSupport

@@ -21,7 +21,7 @@ from mapless_server.bounds import check_bounds
 from ..bundle.estimate import PoseEstimate, PoseStage
 from ..bundle.priors import NO_PRIORS, Priors
 from ..features.views import View
-from ..optim.perturbation import pose_hessian, world_covariance
+from ..optim.optimize import pose_hessian, world_covariance
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import PixelPoints, PointMatches, Structure
 from .with_priors import informed_pose

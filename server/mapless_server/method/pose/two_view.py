@@ -17,7 +17,7 @@ from mapless.geometry import Array, RigidTransform
 from ..bundle.adjust import adjust_pose
 from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage, TwoViewSupport
 from ..bundle.pose_problem import AdjustInput, AdjustOptions
-from ..bundle.unknowns import IntrinsicsSigma
+from ..bundle.priors import IntrinsicsSigma
 from ..features.tracks import Tracks
 from ..features.views import PosedView, View
 from ..pairs.correspond import Correspondences

@@ -23,8 +23,16 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.priors import NO_PRIORS, GravityPrior, PriorCheck, Priors
-from ..optim.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
-from ..optim.perturbation import moved, pose_jacobian, world_jacobian
+from ..optim.optimize import (
+    MinimizeOptions,
+    cauchy_cost,
+    cauchy_weight,
+    damped_step,
+    minimize,
+    moved,
+    pose_jacobian,
+    world_jacobian,
+)
 from ..structure.model import PixelPoints
 
 SIGMA_PX = 1.0

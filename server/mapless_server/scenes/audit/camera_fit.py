@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize, normalize_jacobian
-from mapless_server.method.optim.optimize import cauchy_cost, cauchy_weight, damped_step
-from mapless_server.method.optim.perturbation import motion_jacobian, perturbed
+from mapless_server.method.optim.optimize import cauchy_cost, cauchy_weight, damped_step, motion_jacobian, perturbed
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge.judge import JudgeOptions, judge
-from mapless_server.method.optim.perturbation import world_covariance
+from mapless_server.method.optim.optimize import world_covariance
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pose.pnp import PnpOptions, false_alarms, ransac
 from mapless_server.method.structure.model import PixelPoints, PointMatches

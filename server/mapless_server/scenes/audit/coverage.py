@@ -10,8 +10,8 @@ Occlusion, light and blur are not known: the prediction is for a good photograph
 import numpy as np
 
 from mapless.geometry import Array, Camera, RigidTransform, normalize_jacobian
-from mapless_server.method.bundle.radii import accuracy_from_covariance
-from mapless_server.method.optim.perturbation import motion_jacobian, world_covariance
+from mapless_server.method.bundle.estimate import accuracy_from_covariance
+from mapless_server.method.optim.optimize import motion_jacobian, world_covariance
 
 from .finder import ReferenceFinder
 from .neighbourhood import Neighbourhood, PairMatches, Visibility, Visible, build_neighbourhood, visible_points

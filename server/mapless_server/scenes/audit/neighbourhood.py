@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_server.method.features.nearest import Arithmetic, mutual_matches
+from mapless_server.method.features.matching import Arithmetic, mutual_matches
 from mapless_server.method.features.tracks import Tracks, build_tracks
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.pairs.correspond import Correspondences

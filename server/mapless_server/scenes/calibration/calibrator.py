@@ -13,14 +13,13 @@ from scipy.spatial import KDTree
 
 from mapless.geometry import rotation_angle_deg
 from mapless_server.errors import DataLoss, NotFound
-from mapless_server.method.bundle.estimate import PosedSupport
-from mapless_server.method.bundle.radii import accuracy_from_covariance, viewpoint_gap
+from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance, viewpoint_gap
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.localize import prepare, refine
+from mapless_server.method.localize import refine
 from mapless_server.method.options import LocalizeOptions, StageContext
-from mapless_server.method.pipeline import Pipeline, reconstruct
+from mapless_server.method.pipeline import Pipeline, prepare, reconstruct
 from mapless_server.method.rejection import Rejection
 from mapless_server.security import SceneKey
 from mapless_server.store import SelfCalibration, Store

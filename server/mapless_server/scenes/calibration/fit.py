@@ -26,7 +26,7 @@ import numpy as np
 
 from mapless.geometry import Array
 from mapless_server.bounds import check_bounds
-from mapless_server.method.bundle.radii import Accuracy, growth
+from mapless_server.method.bundle.estimate import Accuracy, growth
 from mapless_server.method.judge.judge import LEVELS
 from mapless_server.store import SelfCalibration
 

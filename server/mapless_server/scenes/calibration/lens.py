@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 from mapless_server.method.bundle.intrinsics import corrected_view, keypoint_motion
-from mapless_server.method.bundle.unknowns import IntrinsicsSigma
+from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.optim.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
 from mapless_server.method.pose.two_view_matches import TwoViewMatches

@@ -14,16 +14,16 @@ from mapless.scenes import FACTORS, MAX_FACTOR, MIN_FACTOR, Calibration
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
 from mapless_server.engine.query import Result
-from mapless_server.method.bundle.estimate import PosedSupport
-from mapless_server.method.bundle.priors import PriorCheck
-from mapless_server.method.bundle.radii import (
+from mapless_server.method.bundle.estimate import (
     TAIL_95,
     Accuracy,
+    PosedSupport,
     accuracy_from_covariance,
     growth,
     self_tail,
     viewpoint_gap,
 )
+from mapless_server.method.bundle.priors import PriorCheck
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.rejection import Hint, IntrinsicsCheck, Rejection
@@ -112,7 +112,7 @@ def reported_radii(
         conditions: what computed the answer.
         kind: kind of the answer, see `store.calibration_kind`; with depths kept with references another one.
         attributes: attributes of the scene.
-        gap: gap of the answer, see `method.bundle.radii.viewpoint_gap`; None if unknown.
+        gap: gap of the answer, see `method.bundle.estimate.viewpoint_gap`; None if unknown.
     """
     measured = attributes.calibration
     if measured is not None and measured.is_of(*astuple(conditions)):

@@ -15,7 +15,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.query import Query
-from mapless_server.method.bundle.radii import accuracy_from_covariance
+from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.security import key_of

@@ -28,12 +28,12 @@ from mapless_server.method.bundle.priors import (
     NO_PRIORS,
     GravityPrior,
     HeadingPrior,
+    IntrinsicsSigma,
     PosePrior,
     PositionPrior,
     Priors,
     check_covariance,
 )
-from mapless_server.method.bundle.unknowns import IntrinsicsSigma
 from mapless_server.method.features.views import seen_share
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.scenes import ANYWHERE, Cone, Narrowing, Sphere

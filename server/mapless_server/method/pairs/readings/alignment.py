@@ -21,8 +21,7 @@ import poselib
 from mapless.geometry import Array, Similarity, cross_matrix, rotation_angle_deg, rotation_from_vector
 
 from ...features.views import PosedView
-from ...optim.optimize import MinimizeOptions, damped_step, minimize, soft_l1, soft_l1_weight
-from ...optim.perturbation import rotation_vector
+from ...optim.optimize import MinimizeOptions, damped_step, minimize, rotation_vector, soft_l1, soft_l1_weight
 from .errors import MatchedPair, PairSample, Views, summary
 
 MOST_PAIRS = 24

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from ...features.nearest import mutual_matches
+from ...features.matching import mutual_matches
 from ...features.views import Features, Matches, PosedView, View
 from ..agreement import MAX_ERROR_PX
 from ..epipolar import BEHIND_SHARE, PosedMatches, fundamental_inliers
