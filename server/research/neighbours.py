@@ -74,7 +74,7 @@ class Server:
         left = int(job.step.bucket)
         result: AnyResult = Done(None)
         if left:
-            fallback = Fallback(lambda: Done(None, Ending.LOW_CONFIDENCE), job.deadline_s - 1)
+            fallback = Fallback[object, None](lambda _: Done(None, Ending.LOW_CONFIDENCE), job.deadline_s - 1)
             result = Next((Step("work", "again", str(left - 1), ATTEMPT_S),), fallback)
         self.scheduler.finish(batch, [result], self.now_s)
 

@@ -9,7 +9,14 @@ from support.planted_engine import SCENE, Setting
 from support.servers import CAMERA, pose
 
 from mapless_server.engine.photos import Photo
+from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.store import NewReference, Store
+
+
+@pytest.fixture(autouse=True)
+def _without_agreements(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How well a scene's poses agree is found in a thread of its own, which reads and describes references, too."""
+    monkeypatch.setattr(SceneAgreements, "touch", lambda *_: None)
 
 
 @pytest.fixture

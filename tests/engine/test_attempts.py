@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +16,20 @@ from support.planted_engine import (
     query_of,
     rejected,
 )
-from support.servers import pose
+from support.servers import CAMERA, pose
 
-from mapless_server.engine.query import Result
+from mapless_server.engine.query import Result, Tried
+from mapless_server.engine.search import Material, Search
+from mapless_server.engine.verdicts import Verdicts
 from mapless_server.method import ladder
+from mapless_server.method.bundle.estimate import Support
 from mapless_server.method.bundle.priors import PositionPrior, Priors
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.judge.hypothesis import Attempt, Doubt
+from mapless_server.method.judge.decide import decide
+from mapless_server.method.judge.hypothesis import Attempt, Doubt, Failed, Solver
 from mapless_server.method.ladder import Rung
+from mapless_server.method.options import DoubtOptions
+from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing
 
 
@@ -101,3 +109,24 @@ def test_a_further_attempt_is_one_row(setting: Setting, monkeypatch: pytest.Monk
     rungs: Sequence[str] = [it.rung for it in result.attempts]
     assert rungs == ["as it is", "again", "stronger"]
     assert again.change(Attempt(), None) != Attempt()
+
+
+@pytest.mark.parametrize("is_part", [True, False])
+def test_a_photograph_of_a_group_keeps_the_matches_it_has(setting: Setting, is_part: bool) -> None:
+    """Its own rejection is the one that says most; its rig is posed by the matches of whatever attempt has some."""
+    unused: Any = SimpleNamespace(features=(), photograph=None, camera=CAMERA)
+    none: Any = None
+    support = Support(unused, (), none, SimpleNamespace(__len__=lambda: 3), np.zeros(3))  # type: ignore[arg-type]
+    cause = Rejection(RejectionReason.LOW_OVERLAP, "planted", Hint("", Advice.ADD_REFERENCES, "planted"))
+    attempts = Attempt(), Attempt(solver=Solver.LINES)
+    answers = replace(rejected(), support=support), Answer(cause)
+    found = tuple(Failed(it, answer, Doubt.STARVED) for it, answer in zip(attempts, answers, strict=True))
+    query = replace(query_of(("r0", "r1")), is_part=is_part)
+    begun: Search = setting.engine.query_job(query, caller()).step.payload
+    material = Material(Attempt(), begun.views, unused, (), 1)
+    verdict = decide(found, Priors())
+    search = replace(begun, found=found, materials=(material,) * 2, tried=attempts, verdict=verdict)
+    search = replace(search, attempts=tuple(Tried(str(i), "", "", 0.0, 0.0) for i in range(2)))
+    answer = Verdicts(setting.tiers, DoubtOptions()).answer(search).answer
+    assert answer.outcome is cause
+    assert answer.support is (support if is_part else None)

@@ -3,6 +3,7 @@
 import gc
 import itertools
 import weakref
+from typing import Any
 
 import numpy as np
 import pytest
@@ -262,7 +263,7 @@ class TestTime:
     def test_what_is_known_is_given_when_the_rest_comes_too_late(self) -> None:
         toy = Toy()
         job = toy.admit(stage="coarse", deadline_s=5.0)
-        fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), 4.5)
+        fallback: Any = Fallback(lambda _: Done("coarse", Ending.DEGRADED), 4.5)
         toy.finish(toy.take("device"), onward(job, fallback))
         assert toy.scheduler.next_due_s == 4.5
         toy.take("host")
@@ -277,7 +278,7 @@ class TestTime:
         refined = 0
         for _ in range(300):
             job = toy.admit(stage="coarse", deadline_s=toy.now_s + 2.0)
-            fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), job.deadline_s - 0.1)
+            fallback: Any = Fallback(lambda _: Done("coarse", Ending.DEGRADED), job.deadline_s - 0.1)
             toy.finish(toy.take("device"), onward(job, fallback))
             if not job.is_over:
                 toy.finish(toy.take("host"), onward(job))

@@ -70,7 +70,11 @@ class Events(RuleBasedStateMachine):
         for job in batch.jobs:
             fate = data.draw(st.sampled_from(["onward", "onward", "done", "fails", "fallback"]))
             due_s = self.toy.now_s + data.draw(st.floats(0.0, 3.0))
-            fallback = Fallback(lambda: Done("coarse", Ending.DEGRADED), due_s) if fate == "fallback" else None
+            fallback = (
+                Fallback[object, object](lambda _: Done("coarse", Ending.DEGRADED), due_s)
+                if fate == "fallback"
+                else None
+            )
             planted: dict[str, AnyResult] = {"done": Done(None), "fails": ValueError("planted")}
             verdicts.append(planted.get(fate) or onward(job, fallback))
         self.toy.scheduler.finish(batch, verdicts, self.toy.now_s)

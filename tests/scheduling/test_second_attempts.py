@@ -13,7 +13,7 @@ def again(toy: Toy, kind: str, others: int, due_s: float = 150.0) -> AnyJob:
     for i in range(others):
         toy.admit(client=f"other {i}")
     step = Step("prepare", kind, "b", "again")
-    toy.finish(toy.take("host"), Next((step,), Fallback(lambda: Done("first"), due_s)))
+    toy.finish(toy.take("host"), Next((step,), Fallback(lambda _: Done("first"), due_s)))
     return job
 
 
@@ -84,7 +84,7 @@ def test_nothing_waits_for_an_idle_thread_while_jobs_are_refused() -> None:
     toy.learn("prepare", "slow", 50.0)
     batch = toy.take("host")
     assert batch.jobs == (job,)
-    toy.finish(batch, Next((Step("prepare", "slow", "b", "again"),), Fallback(lambda: Done("first"), 150.0)))
+    toy.finish(batch, Next((Step("prepare", "slow", "b", "again"),), Fallback(lambda _: Done("first"), 150.0)))
     assert toy.ending_of(job) is Ending.OK
 
 
@@ -105,7 +105,7 @@ def test_a_greedy_caller_takes_no_others_turn(is_crowded: bool, own_jobs: int, d
     for client in map(str, range(100) if is_crowded else ()):
         toy.fill(client)
     step = Step("prepare", "more", "b", "again")
-    toy.finish(batch, Next((step,), Fallback(lambda: Done("first"), due_s)))
+    toy.finish(batch, Next((step,), Fallback(lambda _: Done("first"), due_s)))
     assert toy.ending_of(job) is (None if goes_on else Ending.OK)
     assert not goes_on or job in toy.take("host").jobs + toy.take("host").jobs
 
@@ -123,7 +123,7 @@ def test_the_alternative_is_computed_where_the_step_is_not(due_s: float, others:
     job = toy.admit(stage="refine", client="mine")
     for i in range(others):
         toy.admit(client=f"other {i}")
-    toy.finish(toy.take("host"), Next((step, alternative), Fallback(lambda: Done("first"), due_s)))
+    toy.finish(toy.take("host"), Next((step, alternative), Fallback(lambda _: Done("first"), due_s)))
     assert toy.ending_of(job) is (None if kind else Ending.OK)
     assert kind in (None, job.step.kind)
 
@@ -135,7 +135,7 @@ def test_the_first_step_that_ends_in_time_is_computed(due_s: float, kind: str | 
     toy.learn("prepare", "slow", 2.0)
     steps = tuple(Step("prepare", it, "b", 0, "toy") for it in ("best", "slow", "toy"))
     job = toy.admit(stage="refine", client="mine")
-    toy.finish(toy.take("host"), Next(steps, Fallback(lambda: Done("first"), due_s)))
+    toy.finish(toy.take("host"), Next(steps, Fallback(lambda _: Done("first"), due_s)))
     assert (job.step.kind if kind else None, toy.ending_of(job)) == (kind, None if kind else Ending.OK)
 
 
@@ -146,7 +146,7 @@ def test_of_steps_too_costly_for_the_room_the_last_waits() -> None:
     for i in range(6):
         toy.admit(client=f"other {i}")
     steps = tuple(Step("prepare", kind, "b", 0) for kind in ("slow", "slow", "toy"))
-    toy.finish(toy.take("host"), Next(steps, Fallback(lambda: Done("first"), FAR_S)))
+    toy.finish(toy.take("host"), Next(steps, Fallback(lambda _: Done("first"), FAR_S)))
     assert (job.step.kind, job.begins_until_s is None, toy.ending_of(job)) == ("toy", False, None)
 
 
@@ -158,7 +158,7 @@ def test_steps_but_the_cheapest_are_never_tried_anyway() -> None:
     for _ in range(16):
         job = toy.admit(stage="refine", client="mine")
         steps = tuple(Step("prepare", kind, "b", 0) for kind in ("best", "slow"))
-        toy.finish(toy.take("host"), Next(steps, Fallback(lambda: Done("first"), toy.now_s + 1)))
+        toy.finish(toy.take("host"), Next(steps, Fallback(lambda _: Done("first"), toy.now_s + 1)))
         tried += [] if job.is_over else [job.step.kind]
         toy.scheduler.cancel(job, toy.now_s)
     assert tried == ["slow"] * 2
@@ -184,7 +184,7 @@ def test_the_only_job_leaves_room_for_the_next_caller() -> None:
     toy.learn("prepare", "slow", 50.0)
     job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
     step = Step("prepare", "slow", "b", "again")
-    toy.finish(toy.take("host"), Next((step,), Fallback(lambda: Done("first"), 150.0)))
+    toy.finish(toy.take("host"), Next((step,), Fallback(lambda _: Done("first"), 150.0)))
     toy.take("host")
     other = toy.admit(client="other", deadline_s=5.0)
     assert toy.take("host").jobs == (other,)

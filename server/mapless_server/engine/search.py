@@ -84,8 +84,8 @@ class Material:
 _COUNTS = (2, 5, 10, 20, 64)
 """Queries with about as many references cost about as much."""
 
-SKIPPED = "skipped"
-"""The outcome of an attempt that could not differ from an earlier one."""
+SKIPPED, DOUBTFUL = "skipped", "doubtful"
+"""Outcomes of an attempt that could not differ from an earlier one, and of tracking that left a doubt."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,14 +107,15 @@ class Search:
         materials: for each result, what it was computed from.
         attempts: how each attempt ended.
         verdict: what is answered by now; None before the first result.
-        start_s: when the attempt began, by `time.monotonic`.
+        start_s: when the attempt began to wait for the queue, by `time.monotonic`.
         give_up_s: time after which the verdict so far is the answer, if the attempt has no result by then.
         listings: how often the scene was listed in the attempt.
         attributes: attributes of the scene.
         context: cancels and times the computation from the photograph and references of the attempt.
         spent_s: time of each stage of the computations before it.
-        processor_s: processor time of the attempt until its present stage.
-        stage_processor_s: the thread's processor time when the present stage began; None between stages.
+        computed_s, processor_s: time and processor time of the attempt until its present stage.
+        stage_start_s, stage_processor_s: the time and the thread's processor time when the present stage began; None
+            between stages.
         material: the photograph and references; None until they are chosen.
         prepared: the photographs' matches, for the stage `coarse`.
         coarse: the reconstruction that attempts of one basis begin with.
@@ -139,7 +140,9 @@ class Search:
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
     context: StageContext = field(default_factory=StageContext)
     spent_s: Mapping[str, float] = field(default_factory=dict)
+    computed_s: float = 0.0
     processor_s: float = 0.0
+    stage_start_s: float | None = None
     stage_processor_s: float | None = None
     material: Material | None = None
     prepared: Prepared | None = None
@@ -175,8 +178,8 @@ class Search:
 
     def ended(self, outcome: str, features: str, has_result: bool = False) -> Search:
         """The search after the present attempt, which took the time since it began."""
-        seconds = time.monotonic() - self.start_s
-        ended = Tried(self.rung, features, outcome, seconds, self.spent_processor_s)
+        now = self.paused(self)
+        ended = Tried(self.rung, features, outcome, now.computed_s, now.processor_s)
         before = self.attempt if has_result else self.before
         tried = (*self.tried, self.attempt)
         return replace(self, before=before, tried=tried, attempts=(*self.attempts, ended))
@@ -190,8 +193,10 @@ class Search:
             attempt=attempt,
             give_up_s=give_up_s,
             start_s=time.monotonic(),
+            computed_s=0.0,
             processor_s=0.0,
-            stage_processor_s=processor_s(),
+            stage_start_s=None,
+            stage_processor_s=None,
             listings=1,
             context=StageContext(self.context.check) if is_other else self.context,
             spent_s=self.seconds(features) if is_other else self.spent_s,
@@ -202,16 +207,26 @@ class Search:
         """Time of every stage so far; those of the present photographs after the first ones begin with `features`."""
         is_first = not any(it.basis != self.attempt.basis for it in self.tried if it.where is not Where.NEAR_PRIOR)
         seconds = dict(self.spent_s)
-        for name, spent_s in self.context.stage_seconds.items():
+        for name, spent_s in dict(self.context.stage_seconds).items():  # which a stage may change meanwhile
             name = name if is_first else f"{features}/{name}"
             seconds[name] = seconds.get(name, 0.0) + spent_s
         return seconds
 
-    @property
-    def spent_processor_s(self) -> float:
-        """Processor time of the attempt so far."""
-        begun_s = self.stage_processor_s
-        return self.processor_s + (0.0 if begun_s is None else processor_s() - begun_s)
+    def resumed(self) -> Search:
+        """The search in a stage, in the thread that computes it."""
+        return replace(self, stage_start_s=time.monotonic(), stage_processor_s=processor_s())
+
+    def paused(self, stage: Search) -> Search:
+        """The search after a stage of its attempt, or of another one, whose time is then not its own."""
+        if stage.stage_start_s is None or stage.stage_processor_s is None or stage.rung != self.rung:
+            return replace(self, stage_start_s=None, stage_processor_s=None)
+        return replace(
+            self,
+            computed_s=stage.computed_s + time.monotonic() - stage.stage_start_s,
+            processor_s=stage.processor_s + processor_s() - stage.stage_processor_s,
+            stage_start_s=None,
+            stage_processor_s=None,
+        )
 
     @property
     def best(self) -> Attempt | None:

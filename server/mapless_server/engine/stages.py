@@ -39,7 +39,7 @@ from . import choosing, tracking
 from .failures import failure_of
 from .photos import RasterForm
 from .query import COARSE, PREPARE, REFINE, TRACK, Result, Tier
-from .search import SKIPPED, Search, SearchJob, SearchResult, SearchStep
+from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
 from .verdicts import Verdicts, attributes_of
 
 log = logging.getLogger(__name__)
@@ -102,11 +102,14 @@ class QueryStages:
 
     def coarse(self, jobs: Sequence[SearchJob]) -> list[SearchResult]:
         """Reconstructs many queries together, and estimates the metric scale of each."""
-        begin_s = processor_s()
+        begin_s, start_s = processor_s(), time.monotonic()
         searches = [job.step.payload for job in jobs]
         made = self._method.reconstruct([it.prepared for it in searches if it.prepared is not None])
         share_s = (processor_s() - begin_s) / len(jobs)
-        spent = [replace(it, processor_s=it.processor_s + share_s) for it in searches]
+        took_s = time.monotonic() - start_s
+        spent = [
+            replace(it, processor_s=it.processor_s + share_s, computed_s=it.computed_s + took_s) for it in searches
+        ]
         return [
             self._stage_result(search, partial(self._reconstructed, coarse=coarse))
             for search, coarse in zip(spent, made, strict=True)
@@ -118,7 +121,7 @@ class QueryStages:
 
     def _stage_result(self, search: Search, compute: Callable[[Search], SearchResult]) -> SearchResult:
         """Computes a stage; a failure ends the query with the best answer so far, if there is one."""
-        search = replace(search, stage_processor_s=processor_s())
+        search = search.resumed()
         try:
             return compute(search)
         except Exception as error:
@@ -250,7 +253,7 @@ class QueryStages:
         kept = {name: seconds[name] for name in ("describe", "decode") if name in seconds}  # the search does not repeat
         seconds.clear()
         seconds |= {TRACK: time.monotonic() - begin_s - sum(kept.values())} | kept
-        return self._skipped(search)
+        return self._skipped(search, DOUBTFUL)
 
     def _track(self, search: Search) -> tuple[Search, Found] | None:
         query, context, prior = search.query, search.context, search.query.priors.pose
@@ -303,10 +306,12 @@ class QueryStages:
         search.context.stage_seconds.update(answer.stage_seconds)
         found = self._verdicts.within_limits(search, found_by(search.attempt, answer, self._doubt))
         result = self._verdicts.result(search, found, search.material, found.answer.outcome)
+        tried = search.ended("unfinished", self._verdicts.tier(search.attempt).features).attempts
+        result = replace(result, attempts=tried)
         if search.on_better is not None and isinstance(result.answer.outcome, Localization):
             search.on_better(result)
         done = Done(result, Ending.DEGRADED)
-        return Next((step,), Fallback(lambda: done, search.deadline_s - ANSWER_MARGIN_S))
+        return Next((step,), Fallback(lambda _: done, search.deadline_s - ANSWER_MARGIN_S))
 
     def _refine(self, search: Search) -> SearchResult:
         coarse, attempt = search.coarse, search.attempt
@@ -326,8 +331,7 @@ class QueryStages:
         found = self._verdicts.within_limits(search, found)
         if self._is_like_elsewhere(search, found):
             found = replace(found, doubts=found.doubts | Doubt.LIKE_ELSEWHERE)
-        outcome, material = found.answer.outcome, search.material
-        assert material is not None
+        outcome, material = found.answer.outcome, search.material or search.materials[-1]
         ended = "localized" if isinstance(outcome, Localization) else outcome.reason.value
         before = search.verdict
         search = replace(
@@ -338,7 +342,7 @@ class QueryStages:
         verdict = decide(search.found, search.query.priors, search.attributes.unit)
         search = replace(search, verdict=verdict)
         following = self._climb(search)
-        is_better = before is None or verdict.chosen is not before.chosen
+        is_better = before is None or verdict.outcome is not before.outcome
         is_sent = is_better and isinstance(verdict.outcome, Localization) and isinstance(following, Next)
         if is_sent and search.on_better is not None:
             search.on_better(self._verdicts.answer(search))
@@ -361,18 +365,16 @@ class QueryStages:
             steps.append(further.first_step)
         return self._next(steps[0].payload, *steps) if steps else self._done(search)
 
-    def _skipped(self, search: Search) -> SearchResult:
-        """Goes on after an attempt that would not differ from an earlier one."""
-        return self._climb(search.ended(SKIPPED, self._verdicts.tier(search.attempt).features))
+    def _skipped(self, search: Search, outcome: str = SKIPPED) -> SearchResult:
+        """Goes on after an attempt that has no result."""
+        return self._climb(search.ended(outcome, self._verdicts.tier(search.attempt).features))
 
     def _next(self, search: Search, *steps: SearchStep) -> Next[Search, Result]:
         """Goes on to one of these steps; the best answer so far is given in time if none leads to a better one."""
-        spent_s = search.spent_processor_s
-        steps = tuple(replace(it, payload=replace(it.payload, processor_s=spent_s)) for it in steps)
+        steps = tuple(replace(it, payload=it.payload.paused(search)) for it in steps)
         if search.verdict is None:
             return Next(steps)
-        waiting = replace(search, processor_s=spent_s, stage_processor_s=None)
-        return Next(steps, Fallback(lambda: self._unfinished(waiting, "unfinished"), search.give_up_s))
+        return Next(steps, Fallback(lambda waiting: self._unfinished(waiting, "unfinished"), search.give_up_s))
 
     def _done(self, search: Search) -> Done[Result]:
         answered = self._verdicts.answer(search)

@@ -67,6 +67,8 @@ class Verdicts:
         verdict = search.verdict
         assert verdict is not None
         chosen = verdict.chosen
+        if search.query.is_part and chosen.answer.support is None:  # its group needs what matches there are
+            chosen = next((it for it in reversed(search.found) if it.answer.support is not None), chosen)
         result = self.result(search, chosen, search.materials[search.found.index(chosen)], verdict.outcome)
         ended = zip(search.attempts, search.tried, strict=True)
         return replace(result, attempts=tuple(replace(it, is_chosen=tried == chosen.attempt) for it, tried in ended))

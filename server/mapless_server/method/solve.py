@@ -175,7 +175,7 @@ def _from_lines(coarse: Coarse) -> Answer:
     if rejection:
         return coarse.answer(rejection, support)
     if doubt and lacks_distance(evidence):
-        return coarse.answer(one_reference_rejection(RejectionReason.LOW_OVERLAP, doubt, support))
+        return coarse.answer(one_reference_rejection(doubt, support))
     if doubt or trust < 1 - prepared.options.coverage:
         message = doubt or f"the trust of the pose from epipolar lines is {trust:.3f}"
         return coarse.answer(Rejection(RejectionReason.TOO_FEW_MATCHES, message))

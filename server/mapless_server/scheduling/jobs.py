@@ -142,10 +142,13 @@ class Done(Generic[ValueT]):
 
 
 @dataclass(frozen=True, eq=False)
-class Fallback(Generic[ValueT]):
-    """Makes the result that is given at `at_s`, by the queue's clock, if there is no better one."""
+class Fallback(Generic[PayloadT, ValueT]):
+    """Makes the result that is given at `at_s`, by the queue's clock, if there is no better one.
 
-    make: Callable[[], Done[ValueT]]
+    It is made from the payload of the step that the job has then.
+    """
+
+    make: Callable[[PayloadT], Done[ValueT]]
     at_s: float
 
 
@@ -160,7 +163,7 @@ class Next(Generic[PayloadT, ValueT]):
     """
 
     steps: tuple[Step[PayloadT], ...]
-    fallback: Fallback[ValueT] | None = None
+    fallback: Fallback[PayloadT, ValueT] | None = None
 
     def __post_init__(self) -> None:
         if not self.steps:
@@ -245,7 +248,7 @@ class Job(Generic[PayloadT, ValueT]):
     records: list[StageRecord] = field(default_factory=list)
     continues: bool = False
     used_s: float = 0.0
-    fallback: Fallback[ValueT] | None = None
+    fallback: Fallback[PayloadT, ValueT] | None = None
     waits_since_s: float = 0.0
     begins_until_s: float | None = None
     booked_s: Counter[str] = field(default_factory=Counter)
@@ -285,7 +288,7 @@ class Job(Generic[PayloadT, ValueT]):
 
 
 AnyStep = Step[Any]
-AnyFallback = Fallback[Any]
+AnyFallback = Fallback[Any, Any]
 AnyNext = Next[Any, Any]
 AnyResult = StageResult[Any, Any]
 AnyJob = Job[Any, Any]

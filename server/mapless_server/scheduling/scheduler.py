@@ -370,5 +370,5 @@ class Scheduler:
         self._observer.ended(stage.name, ending)
 
     def _give_fallback(self, job: AnyJob, fallback: AnyFallback, now_s: float) -> None:
-        done = fallback.make()
+        done = fallback.make(job.step.payload)
         self._end(job, done.ending, done.value, now_s)

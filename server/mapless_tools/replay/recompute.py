@@ -284,8 +284,9 @@ def _compute(stages: QueryStages, job: SearchJob) -> Result:
 
 
 def given_up(then: pb.Diagnostics, tiers: Sequence[Tier]) -> Callable[[Search], bool]:
-    """Which further attempts had no time, of an answer with these diagnostics."""
-    unfinished = {(it.rung, it.features) for it in then.attempts if it.outcome == "unfinished"}
+    """Which further attempts had no result, of an answer with these diagnostics."""
+    ended = ("unfinished", "failed", "out_of_memory")
+    unfinished = {(it.rung, it.features) for it in then.attempts if it.outcome in ended}
     return lambda search: (search.rung, tiers[search.attempt.features].features) in unfinished
 
 

@@ -163,14 +163,14 @@ def two_view_failure(evidence: TwoViewEvidence) -> str | None:
     return None
 
 
-def one_reference_rejection(reason: RejectionReason, message: str, support: PosedSupport) -> Rejection:
+def one_reference_rejection(message: str, support: PosedSupport) -> Rejection:
     """Makes the rejection of a pose without a distance, with its hint."""
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     advice = (
         f"Add references that show the same as {best} from a step aside, or use others: one reference determines the "
         "direction but not the distance."
     )
-    return Rejection(reason, message, Hint("two_view", Advice.ADD_REFERENCES, advice, best))
+    return Rejection(RejectionReason.LOW_OVERLAP, message, Hint("two_view", Advice.ADD_REFERENCES, advice, best))
 
 
 def two_view_trust(evidence: TwoViewEvidence) -> float:
