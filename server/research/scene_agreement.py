@@ -23,8 +23,7 @@ import numpy as np
 
 from mapless.geometry import RigidTransform, rotation_angle_deg
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Description, Photo
-from mapless_server.engine.query import Caller, Query
+from mapless_server.engine.query import Caller, Description, Photo, Query
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.images import ImageLimits
 from mapless_server.method.judge.answer import Localization

@@ -8,7 +8,7 @@ from support.images import encode, textured
 from support.planted_engine import SCENE, Setting
 from support.servers import CAMERA, pose
 
-from mapless_server.engine.photos import Photo
+from mapless_server.engine.query import Photo
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.store import NewReference, Store
 

@@ -31,8 +31,7 @@ from support.planted_engine import (
 from support.servers import CAMERA, PHOTO, StandInExtractor, pose, whole
 
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import Result, Tier
+from mapless_server.engine.query import Photo, Result, Tier
 from mapless_server.engine.search import SearchJob
 from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
 from mapless_server.errors import InvalidArgument, Unavailable

@@ -17,8 +17,7 @@ from support.servers import CAMERA
 
 from mapless_server.engine.groups import PhotoGroup
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import PREPARE, Caller, Query, Result
+from mapless_server.engine.query import PREPARE, Caller, Photo, Query, Result
 from mapless_server.engine.queue_engine import JOIN, QueueEngine
 from mapless_server.errors import DeadlineExceeded, NotFound, Overloaded, RequestError, Unavailable
 from mapless_server.method.options import LocalizeOptions

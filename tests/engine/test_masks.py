@@ -11,8 +11,7 @@ from support.corner import CAMERA, photograph, pose
 from support.images import encode, textured
 
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import Caller, Query, Result, Tier
+from mapless_server.engine.query import Caller, Photo, Query, Result, Tier
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.extractors import SiftExtractor

@@ -15,8 +15,7 @@ from support.images import encode, textured
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.engine import choosing
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import TRACK, Caller, Query, Result, Tier
+from mapless_server.engine.query import TRACK, Caller, Photo, Query, Result, Tier
 from mapless_server.errors import DataLoss
 from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.bundle.priors import NO_PRIORS, HeadingPrior, PosePrior, PositionPrior, Priors

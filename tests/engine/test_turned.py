@@ -20,8 +20,7 @@ from mapless.axes import turned_raster
 from mapless.geometry import Camera
 from mapless_server.engine import choosing
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Photo, QueryViews, RasterForm
-from mapless_server.engine.query import TURN, Caller, Query, Result, Tier
+from mapless_server.engine.query import TURN, Caller, Photo, Query, QueryViews, RasterForm, Result, Tier
 from mapless_server.engine.search import Search
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.views import Ignored, View, view_of

@@ -24,8 +24,7 @@ from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Description, Photo
-from mapless_server.engine.query import Caller
+from mapless_server.engine.query import Caller, Description, Photo
 from mapless_server.method.features.views import Features, View
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Coverage, CoverageVerdict, Narrowing, Viewpoint

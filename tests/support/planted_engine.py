@@ -10,8 +10,7 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Description, Photo
-from mapless_server.engine.query import Caller, Query, Result, Tier
+from mapless_server.engine.query import Caller, Description, Photo, Query, Result, Tier
 from mapless_server.engine.search import SearchJob
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.bundle.estimate import PoseStage

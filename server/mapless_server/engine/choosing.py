@@ -9,6 +9,7 @@ from functools import partial
 
 from scipy.special import bdtrc
 
+from mapless_server.engine.query import QueryViews, RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
 from mapless_server.method.judge.decide import CLEARLY_MORE
@@ -19,7 +20,6 @@ from mapless_server.scenes.library import Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
 
 from . import tracking
-from .photos import QueryViews, RasterForm
 from .query import TURN, Tier
 from .search import Search
 

@@ -6,6 +6,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import TypeVar
 
+from mapless_server.engine.query import Description, Photo, QueryViews
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
 from mapless_server.method.options import StageContext
 from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Selection, Viewpoint
@@ -32,7 +33,6 @@ from mapless_server.security import SceneKey
 
 from .failures import failure_of
 from .options import EngineOptions
-from .photos import Description, Photo, QueryViews
 from .query import COARSE, PREPARE, REFINE, Caller, Query, ReferenceSource, Result, Tier
 from .references import References
 from .search import Search, SearchJob

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from mapless.names import reference_name
+from mapless_server.engine.query import Description, Photo, QueryViews
 from mapless_server.errors import DataLoss, InvalidArgument, NotFound
 from mapless_server.images import ImageLimits
 from mapless_server.method.features.extractors import FeatureExtractor
@@ -15,7 +16,6 @@ from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 
-from .photos import Description, Photo, QueryViews
 from .query import POSE_PRIOR
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from mapless_server.engine.query import QueryViews
 from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.judge.hypothesis import Attempt, Hypothesis, Where
 from mapless_server.method.ladder import Situation, first_attempt
@@ -17,7 +18,6 @@ from mapless_server.scenes import Choice
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
 from mapless_server.store import SceneAttributes
 
-from .photos import QueryViews
 from .query import PREPARE, REFINE, Query, ReferenceSource, Result, Tried
 
 if TYPE_CHECKING:  # services need not load what computes

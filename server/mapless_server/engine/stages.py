@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from mapless_server.engine.query import RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method import ladder, pipeline
@@ -37,7 +38,6 @@ from mapless_server.scheduling import (
 
 from . import choosing, tracking
 from .failures import failure_of
-from .photos import RasterForm
 from .query import COARSE, PREPARE, REFINE, TRACK, Result, Tier
 from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
 from .verdicts import Verdicts, attributes_of

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import Caller, Query, Tier
+from mapless_server.engine.query import Caller, Photo, Query, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import Photograph, PosedView

@@ -14,8 +14,7 @@ from mapless.geometry import MAX_COORDINATE_M, RigidTransform
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
-from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT
+from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.rpc import Call
 from mapless_server.scenes import Viewpoint

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from mapless.names import reference_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import QueryViews
 from mapless_server.engine.query import (
     COARSE,
     POSE_PRIOR,
@@ -30,6 +29,7 @@ from mapless_server.engine.query import (
     REFINE,
     Caller,
     Query,
+    QueryViews,
     Result,
     Tier,
 )

@@ -21,8 +21,7 @@ from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, camera_from_message, joined, transform_from_message, vector_from_message
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.photos import Photo
-from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Query
+from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
 from mapless_server.images import ImageLimits, check_mask, image_size
 from mapless_server.method.bundle.priors import (
     NO_PRIORS,
