@@ -1,4 +1,4 @@
-"""What an answer was computed from: references, matches, attempts, software and times."""
+"""Data that an answer was computed from: references, matches, attempts, software and times."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from .geometry import Array
 
 @dataclass(frozen=True)
 class ReferenceUse:
-    """What one reference contributes: its matches with the photograph, and how many of them are inliers of the pose.
+    """The contribution of one reference: its matches with the photograph, and how many of them are inliers of the pose.
 
     `similarity` is the cosine similarity to the photograph, -1 to 1, if the server chose the reference; else 0.
     """
@@ -61,7 +61,7 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What an answer was computed from, by what software, and in what time.
+    """Data and software that an answer was computed from, and the time it took.
 
     Attributes:
         request_id: identifies the call in the server's log.

@@ -1,4 +1,4 @@
-"""What is tried after a doubtful answer: each attempt a step of the queue, counted, and one row of a table."""
+"""Attempts after a doubtful answer: each a step of the queue, counted, and one row of a table."""
 
 from collections.abc import Sequence
 from dataclasses import replace

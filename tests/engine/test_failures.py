@@ -1,4 +1,4 @@
-"""What a failure says of the job, the device and the server."""
+"""Failures: of the job, of its input, of the device."""
 
 from collections.abc import Callable
 

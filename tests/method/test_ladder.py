@@ -1,4 +1,4 @@
-"""Which attempt follows which, for which doubts."""
+"""The order of attempts, by the doubts that are left."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What each kind of attempt is worth, on planted answers with known errors."""
+"""The worth of each kind of attempt, on planted answers with known errors."""
 
 import math
 from io import StringIO

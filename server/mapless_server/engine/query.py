@@ -63,7 +63,7 @@ class Photo:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """What the store keeps of a photograph besides the photograph itself.
+    """The data that the store keeps of a photograph besides the photograph itself.
 
     Views, without pixels, are by the extractor's name, the first tier's first; descriptors by their own. The mask
     ignores a share of the pixels, 0 to 1.

@@ -185,7 +185,7 @@ class QueryStages:
         return search
 
     def _material(self, search: Search) -> Material | None:
-        """What the attempt is computed from; None if that is what an earlier one was computed from."""
+        """The photograph and references of the attempt; None if an earlier attempt had the same."""
         attempt, known = search.attempt, search.material
         is_known = known is not None and known.basis == attempt.basis
         material = known if is_known else choosing.described_anew(search, self._verdicts.tier(attempt))

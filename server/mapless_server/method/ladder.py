@@ -13,7 +13,7 @@ from .pairs.pair import Matching
 
 @dataclass(frozen=True)
 class Situation:
-    """What a photograph, its request and the server have, on which rungs depend.
+    """Properties of a photograph, its request and the server, on which rungs depend.
 
     Attributes:
         is_best: whether the variant of the method is the best one; the paper's has one attempt.

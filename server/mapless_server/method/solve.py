@@ -57,7 +57,7 @@ def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
 
 
 def _without_priors(coarse: Coarse) -> Coarse:
-    """What the coarse stage gives without priors."""
+    """The result of the coarse stage without priors."""
     free = replace(coarse, prepared=replace(coarse.prepared, priors=NO_PRIORS))
     if alone := coarse.rejected_alone:
         return replace(free, reconstruction=alone, scale=alone)

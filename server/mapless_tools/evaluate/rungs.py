@@ -1,4 +1,4 @@
-"""What each kind of attempt at a pose is worth: on how many photographs it was made, and what it gave there."""
+"""The worth of each kind of attempt at a pose: on how many photographs it was made, and its results there."""
 
 import itertools
 from collections.abc import Sequence

@@ -284,7 +284,7 @@ def _compute(stages: QueryStages, job: SearchJob) -> Result:
 
 
 def given_up(then: pb.Diagnostics, tiers: Sequence[Tier]) -> Callable[[Search], bool]:
-    """Which further attempts had no result, of an answer with these diagnostics."""
+    """Says of a further attempt whether it had no result in an answer with these diagnostics."""
     ended = ("unfinished", "failed", "out_of_memory")
     unfinished = {(it.rung, it.features) for it in then.attempts if it.outcome in ended}
     return lambda search: (search.rung, tiers[search.attempt.features].features) in unfinished

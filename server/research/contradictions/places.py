@@ -48,7 +48,7 @@ class Place:
         return trajectory_radius(np.array([it.world_from_camera.translation for it in self.dataset.frames]))
 
     def references(self) -> list[NewReference]:
-        """What the scene stores."""
+        """The data that the scene stores."""
         copied = self.reference_frames[:: self.copy_stride] if self.copy_stride else ()
         return [
             NewReference(f"{name}{it.name}", it.image_path, it.camera, it.world_from_camera.shifted([x, 0.0, 0.0]))

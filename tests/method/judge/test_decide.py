@@ -1,4 +1,4 @@
-"""Which of several hypotheses is answered: one rule, on planted poses and on planted matches."""
+"""One rule decides which of several hypotheses is answered, on planted poses and on planted matches."""
 
 from dataclasses import replace
 from typing import Any

@@ -46,7 +46,7 @@ from .pose_problem import (
 from .priors import NO_PRIORS, IntrinsicsSigma, Priors
 
 WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
-"""Of an estimated parameter: focal length and k1, and principal point as a share of the width."""
+"""Least standard deviations of an estimated parameter's prior: focal length, k1, and shares of the width."""
 MAX_HELD = 3.0
 """An estimate that leaves the prior by more standard deviations has diverged."""
 LINEAR_CHANGE = np.array([0.01, 0.01, 0.01, 0.02])
@@ -275,7 +275,7 @@ def _at_optimum(
 
 
 def intrinsics_terms(given: AdjustInput) -> IntrinsicsTerms:
-    """What is known of the query's intrinsics without its matches."""
+    """The query's intrinsics as they are known without its matches."""
     usual = (given.intrinsics or IntrinsicsSigma()).of(given.query.camera)
     is_shared = given.intrinsics is None and shares_camera(given.query, given.references)
     return IntrinsicsTerms(given.query, usual, SHARED_CAMERA * usual if is_shared else usual)

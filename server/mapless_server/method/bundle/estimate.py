@@ -1,6 +1,6 @@
-"""A pose and its support: data between the estimators and the judge.
+"""A pose, its support and its radii: data between the estimators and the judge.
 
-Radii of a pose, which errors do not exceed with a given probability; growth of errors with the distance.
+Errors do not exceed the radii with a given probability; they grow with the distance.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Normal equations of a bundle adjustment, from observations sorted by view, and the elimination of the points.
 
-Unknowns of a bundle adjustment: poses of cameras, points, and errors of the query's intrinsics.
+The unknowns are poses of cameras, points, and errors of the query's intrinsics.
 """
 
 from __future__ import annotations

@@ -175,7 +175,7 @@ class AdjustInput:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """What was solved of a query's adjustment.
+    """The solution of a query's adjustment.
 
     Attributes:
         given: what the pose was adjusted to.

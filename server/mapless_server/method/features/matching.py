@@ -1,6 +1,6 @@
 """How two photographs are matched: options of each kind of features, nearest neighbours, and what a network offers.
 
-Two photographs: nearest neighbours of their descriptors.
+Nearest neighbours are those of the descriptors.
 """
 
 import time

@@ -18,7 +18,7 @@ Matches = NDArray[np.int32]
 """(M, 2): keypoint indices in the first and in the second of two views."""
 
 Rows = NDArray[np.intp] | NDArray[np.int32] | NDArray[np.bool_] | slice
-"""Which rows of an array: indices, a mask or a range."""
+"""Rows of an array: indices, a mask or a range."""
 
 Ignored = NDArray[np.bool_]
 """(H, W): pixels of an image that show nothing of the place, by the mask that was given with it."""

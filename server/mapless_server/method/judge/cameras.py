@@ -4,7 +4,7 @@ Intrinsics of another image, half or double the focal length, or a wide lens who
 off for the linear check (`intrinsics`): a pose then fits a part of the matches, at similar depths or near the centre,
 and these alone do not contradict it. But with a camera that is nearer to the true one far more of all matches agree
 with one pose. So poses are computed with other focal lengths, with other values of k1 and without the lens, and, where
-these are unusual, with the principal point in the centre and with square pixels; the score of `two_view.pose` compares
+these are unusual, with the principal point in the centre and with square pixels; the score of `pose.relative` compares
 them, by points and by matches without points together. That costs a query nothing of which the linear check is certain.
 
 Checks of a photograph's intrinsics against its matches.
@@ -83,7 +83,7 @@ def _sentence(check: IntrinsicsCheck) -> str:
 
 
 def advice_for(lens: Distortion | None, wrong: Sequence[IntrinsicsCheck]) -> str:
-    """What to check, in words, of a camera with this lens of which these parameters are wrong."""
+    """The parameters to check, in words, of a camera with this lens of which these parameters are wrong."""
     found = {it.parameter: it for it in wrong}
     radial = found.get(IntrinsicsParameter.K1)
     if radial is not None and lens == Fisheye():

@@ -43,7 +43,7 @@ CLEARLY_MORE = 1.5
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What is answered after the attempts so far.
+    """The answer after the attempts so far.
 
     Attributes:
         chosen: the attempt's result that is answered, or whose data go with a rejection.

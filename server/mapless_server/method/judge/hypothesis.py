@@ -1,6 +1,6 @@
-"""The result of an attempt: a hypothesis, which has a pose, or a failure without one; and the doubts that it leaves.
+"""An attempt at a photograph's pose, its result, and the doubts that it leaves.
 
-An attempt at a photograph's pose: its features, references, matches and solver.
+The result is a hypothesis, which has a pose, or a failure without one.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ class Raster(Enum):
 
 
 class Where(Enum):
-    """Which references are used."""
+    """The references that are used."""
 
     LIKELY = "likely"
     """Those that the caller names, or those that resemble the photograph, where soft priors say that it is."""
