@@ -14,7 +14,6 @@ pytest.importorskip("torch", reason="the networks' extra is not installed")
 from support.images import textured
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.method.coarse.grids import GridOptions
 from mapless_server.method.coarse.network import NetworkOptions, NetworkReconstructor
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.views import Photograph, PosedView, View
@@ -64,7 +63,7 @@ def position(backend: Any, variant: Variant) -> NDArray[np.float64]:
 def test_the_pages_network_localizes() -> None:
     """It takes the pose of a reference; the rest of the method finds where between them the photograph was taken."""
     runner = NetworkRunner(on_the_page("MostAlike")(), "most-alike", "", "cpu")
-    options = NetworkOptions(grids=GridOptions(pixel_limit=20 * 14**2))
+    options = NetworkOptions(pixel_limit=20 * 14**2)
     with closing(NetworkReconstructor(runner, options)) as backend:
         coarse = position(backend, Variant.COARSE)
         assert min(abs(coarse[0] - it.world_from_camera.translation[0]) for it in references()) < 0.01

@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from support.images import textured
 from support.scenes import random_for
 from support.small_networks import (
-    GRIDS,
+    PIXEL_LIMIT,
     SMALL_MEGALOC,
     photograph,
     ruled_megaloc,
@@ -120,8 +120,8 @@ def test_without_flash_attention_it_computes_in_full_precision(file: Path, monke
     np.testing.assert_allclose(on_device.describe_many(VIEWS), on_host.describe_many(VIEWS), rtol=0, atol=1e-3)
 
 
-OPTIONS = NetworkOptions(grids=GRIDS)
-UNCACHED = NetworkOptions(grids=GRIDS, cache=TokenCacheOptions(0, 0))
+OPTIONS = NetworkOptions(pixel_limit=PIXEL_LIMIT)
+UNCACHED = NetworkOptions(pixel_limit=PIXEL_LIMIT, cache=TokenCacheOptions(0, 0))
 
 
 class TightRunner(NetworkRunner):

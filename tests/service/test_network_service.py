@@ -18,7 +18,7 @@ import grpc
 import torch
 from support.images import encode, textured
 from support.servers import RunningServer, failure_of, localize_request, serving
-from support.small_networks import GRIDS, small_network
+from support.small_networks import PIXEL_LIMIT, small_network
 from support.waiting import wait_until
 
 from mapless import Client, DeadlineExceeded, LocalizationResult, NewReference, Rejected, Unavailable, wire
@@ -62,7 +62,7 @@ def on_network(
     torch.set_num_threads(1)
     runner = NetworkRunner(network, name, f"sha-of-{name}", "cpu")
     with (
-        closing(NetworkReconstructor(runner, NetworkOptions(grids=GRIDS))) as backend,
+        closing(NetworkReconstructor(runner, NetworkOptions(pixel_limit=PIXEL_LIMIT))) as backend,
         serving(
             data_dir, method=method or Method(), tier=Tier(SiftExtractor(), Pipeline(backend)), **options
         ) as server,

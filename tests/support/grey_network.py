@@ -15,12 +15,12 @@ from mapless_server.method.coarse.token_cache import TokenCacheOptions
 from mapless_server.method.features.views import PosedView, Reconstruction, View
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
-from support.small_networks import GRIDS, photograph, references_of, view_of
+from support.small_networks import PIXEL_LIMIT, photograph, references_of, view_of
 
 torch.set_num_threads(1)  # its matrices are too small for more
 
-OPTIONS = NetworkOptions(grids=GRIDS)
-UNCACHED = NetworkOptions(grids=GRIDS, cache=TokenCacheOptions(0, 0))
+OPTIONS = NetworkOptions(pixel_limit=PIXEL_LIMIT)
+UNCACHED = NetworkOptions(pixel_limit=PIXEL_LIMIT, cache=TokenCacheOptions(0, 0))
 
 
 @dataclass

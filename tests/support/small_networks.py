@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.method.coarse.grids import GridOptions
 from mapless_server.method.features.views import Features, Photograph, PosedView, View
 from mapless_server.networks.mapanything import MapAnything
 from mapless_server.networks.megaloc import MegaLoc, MegaLocSizes
@@ -18,7 +17,7 @@ from mapless_server.networks.runner import NetworkRunner
 from support.images import textured
 from support.parity_rule import ruled_network, weights
 
-GRIDS = GridOptions(pixel_limit=20 * 14**2)
+PIXEL_LIMIT = 20 * 14**2
 """5 x 4 patches for 4:3."""
 NOTHING = Features(np.empty((0, 2), np.float32), np.empty((0, 4), np.float32), np.empty(0, np.float32))
 

@@ -15,14 +15,13 @@ from .bundle.pose_problem import AdjustOptions
 from .bundle.priors import NO_PRIORS, Priors
 from .coarse import Outcome, Reconstructor, Request, Triangulation, reconstruct_one
 from .coarse.geometric import GeometricReconstructor, point_maps
-from .coarse.scale import ScaleOptions, estimate_scale, known_scale, network_scale
+from .coarse.scale import estimate_scale, known_scale, network_scale
 from .features.views import Matches, PosedView, Reconstruction, View
 from .judge.answer import Answer, Localization, shifted
 from .judge.judge import JudgeOptions
 from .options import LocalizeOptions, StageContext, Variant
 from .pairs.correspond import Correspondences, Matcher
 from .pairs.pair import Matching
-from .pose.one_reference import OneReferenceOptions
 from .pose.pnp import PnpOptions
 from .rejection import Rejection, RejectionReason
 from .structure.kept_depth import with_kept_depths
@@ -45,13 +44,11 @@ class StageOptions:
         pnp: options of the pose solver.
         adjust: options of the final adjustment.
         judge: options of the judge.
-        one_reference: options of the pose from a single reference, with a network that predicts metres.
     """
 
     pnp: PnpOptions = field(default_factory=PnpOptions)
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
     judge: JudgeOptions = field(default_factory=JudgeOptions)
-    one_reference: OneReferenceOptions = field(default_factory=OneReferenceOptions)
 
     @staticmethod
     def structure(variant: Variant) -> StructureOptions:
@@ -279,16 +276,16 @@ def _scaled(prepared: Prepared, reconstruction: Outcome) -> Coarse:
     """The metric scale of a reconstruction."""
     if isinstance(reconstruction, Rejection):
         return Coarse(prepared, reconstruction, reconstruction)
-    references, options = prepared.references, ScaleOptions(prepared.options.scale_strategy)
+    references, strategy = prepared.references, prepared.options.scale_strategy
     with prepared.context.stage("scale"):
         if isinstance(reconstruction, Triangulation):
             if prepared.options.variant in (Variant.BEST, Variant.COARSE):
                 structure, pose = reconstruction.structure, reconstruction.world_from_query
-                return Coarse(prepared, reconstruction, known_scale(structure, pose, references, options))
+                return Coarse(prepared, reconstruction, known_scale(structure, pose, references, strategy))
             reconstruction = point_maps(reconstruction, prepared.query, references)
         if len(references) == 1 and reconstruction.metre_sigma is not None:
             return Coarse(prepared, reconstruction, network_scale(reconstruction, references[0]))
-        scale = estimate_scale(reconstruction, references, prepared.correspondences, options)
+        scale = estimate_scale(reconstruction, references, prepared.correspondences, strategy)
         return Coarse(prepared, reconstruction, scale)
 
 

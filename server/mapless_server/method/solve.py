@@ -137,12 +137,12 @@ def _judged(support: PosedSupport, coarse: Coarse, chance: float, agreement: flo
 
 def _from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
     """Estimates the pose from a single reference with a network's depths; priors are compared with it, but not used."""
-    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    prepared = coarse.prepared
     assert isinstance(coarse.reconstruction, Reconstruction)
-    given = prepared.query, prepared.references, coarse.reconstruction, scale, prepared.correspondences.query_matches
+    (reference,), (matches,) = prepared.references, prepared.correspondences.query_matches
+    (predicted,), fixed = coarse.reconstruction.references, prepared.pipeline.matcher.stationary
     with prepared.context.stage("pnp"):
-        fixed = prepared.pipeline.matcher.stationary
-        found = solve_one_reference(*given, prepared.origin, options.one_reference, fixed)
+        found = solve_one_reference(prepared.query, reference, matches, predicted, scale, prepared.origin, fixed)
     if isinstance(found, Rejection):
         return coarse.answer(found)
     estimate = found.support.estimate

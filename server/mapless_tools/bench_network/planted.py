@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless_server.method.coarse import Outcome, Request
-from mapless_server.method.coarse.grids import GridOptions, common_grid, lay_out
+from mapless_server.method.coarse.grids import PIXEL_LIMIT, common_grid, lay_out
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.features.views import PosedView, ReconstructedView, Reconstruction, View
 from mapless_server.method.rejection import Rejection
@@ -92,8 +92,7 @@ class PlantedReconstructor:
 
 def true_points(truth: Truth) -> NDArray[np.float32]:
     """Points (H, W, 3) that the pixels of the network's picture show, in the camera's frame, planted units."""
-    options = GridOptions()
-    camera = lay_out(truth.camera, common_grid([truth.camera], options), options).camera
+    camera = lay_out(truth.camera, common_grid([truth.camera], PIXEL_LIMIT), PIXEL_LIMIT).camera
     rows, columns = np.indices((camera.height_px, camera.width_px))
     rays = camera.rays(np.stack([columns, rows], axis=-1))
     height, width = truth.depth_m.shape

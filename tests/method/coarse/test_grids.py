@@ -13,8 +13,8 @@ from support.images import textured
 from mapless.geometry import Array, Camera
 from mapless.lenses import Fisheye, RadialTangential
 from mapless_server.method.coarse.grids import (
+    PIXEL_LIMIT,
     Grid,
-    GridOptions,
     common_grid,
     fitted_grid,
     lay_out,
@@ -22,7 +22,6 @@ from mapless_server.method.coarse.grids import (
 )
 from mapless_server.method.features.views import undistort_pixels
 
-OPTIONS = GridOptions()
 OFFICIAL_PIXEL_LIMIT = 255_000
 """Of the official loader; 574x434 for 4:3."""
 BARREL = RadialTangential(-0.25, 0.07, 0.001, -0.0015, -0.005)
@@ -68,18 +67,17 @@ def test_sizes_are_those_of_the_official_loader() -> None:
     for aspect, size in sizes.items():
         grid = fitted_grid(*aspect, OFFICIAL_PIXEL_LIMIT)
         assert (grid.width_px, grid.height_px) == size
-    assert natural_grid(camera_of(640, 480), OPTIONS) == Grid(37, 28)
+    assert natural_grid(camera_of(640, 480), PIXEL_LIMIT) == Grid(37, 28)
 
 
-@pytest.mark.parametrize("limit", [OPTIONS.pixel_limit, OFFICIAL_PIXEL_LIMIT])
+@pytest.mark.parametrize("limit", [PIXEL_LIMIT, OFFICIAL_PIXEL_LIMIT])
 def test_a_usual_photograph_fills_its_grid(limit: int) -> None:
     """From 1:2 to 2:1 the nearest grid is within the stretch that is allowed, so that nothing need be filled."""
-    options = GridOptions(limit)
     for aspect in np.geomspace(0.5, 2.0, 101):
         layout = lay_out(
             camera_of(1000, round(1000 / aspect)),
-            grid := natural_grid(camera_of(1000, round(1000 / aspect)), options),
-            options,
+            grid := natural_grid(camera_of(1000, round(1000 / aspect)), limit),
+            limit,
         )
         assert layout.shown is None
         assert layout.box == (0, 0, grid.width_px, grid.height_px)
@@ -88,14 +86,16 @@ def test_a_usual_photograph_fills_its_grid(limit: int) -> None:
 
 def test_the_common_grid_is_that_of_most_references() -> None:
     landscape, portrait, square = camera_of(640, 480), camera_of(480, 640), camera_of(500, 500)
-    assert common_grid([square, portrait, landscape, portrait], OPTIONS) == natural_grid(portrait, OPTIONS)
-    assert common_grid([square, landscape, portrait], OPTIONS) == natural_grid(square, OPTIONS)
-    assert common_grid([square, landscape, portrait, portrait, landscape], OPTIONS) == natural_grid(landscape, OPTIONS)
+    assert common_grid([square, portrait, landscape, portrait], PIXEL_LIMIT) == natural_grid(portrait, PIXEL_LIMIT)
+    assert common_grid([square, landscape, portrait], PIXEL_LIMIT) == natural_grid(square, PIXEL_LIMIT)
+    assert common_grid([square, landscape, portrait, portrait, landscape], PIXEL_LIMIT) == natural_grid(
+        landscape, PIXEL_LIMIT
+    )
 
 
 def test_undistorted_pictures_equal_the_official_loaders() -> None:
     photograph = textured(752, 480, seed=3)
-    layout = lay_out(camera_of(752, 480), Grid(45, 28), OPTIONS)
+    layout = lay_out(camera_of(752, 480), Grid(45, 28), PIXEL_LIMIT)
     official = np.asarray(Image.fromarray(photograph).resize((630, 392), Image.Resampling.LANCZOS), np.float32) / 255
     picture = layout.picture(photograph)
     assert picture.dtype == np.float32
@@ -104,7 +104,7 @@ def test_undistorted_pictures_equal_the_official_loaders() -> None:
 
 def test_large_photographs_nearly_equal_the_official_loaders() -> None:
     photograph = textured(2800, 2100, seed=5)
-    layout = lay_out(camera_of(2800, 2100), Grid(37, 28), OPTIONS)
+    layout = lay_out(camera_of(2800, 2100), Grid(37, 28), PIXEL_LIMIT)
     official = np.asarray(Image.fromarray(photograph).resize((518, 392), Image.Resampling.LANCZOS), float)
     difference = 255 * layout.picture(photograph).transpose(1, 2, 0) - official
     assert np.abs(difference).max() < 5
@@ -115,7 +115,7 @@ def test_large_photographs_nearly_equal_the_official_loaders() -> None:
 @pytest.mark.parametrize("name", CAMERAS)
 def test_planted_blobs_are_where_the_camera_projects_them(name: str, grid: Grid) -> None:
     camera = CAMERAS[name]
-    layout = lay_out(camera, grid, OPTIONS)
+    layout = lay_out(camera, grid, PIXEL_LIMIT)
     left, top, width, height = layout.box
     across, down = (np.linspace(start + 16, start + side - 17, 4) for start, side in ((left, width), (top, height)))
     rays = layout.camera.rays(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
@@ -139,7 +139,7 @@ FOLDING_EVERYWHERE = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, RadialTangenti
 @pytest.mark.parametrize("camera", [*CAMERAS.values(), FOLDING_EVERYWHERE], ids=[*CAMERAS, "folding at every edge"])
 def test_shown_is_the_mask_of_the_photographs_pixels(camera: Camera) -> None:
     """Each shown pixel's ray comes back through the lens, and everything else has one colour."""
-    layout = lay_out(camera, natural_grid(camera, OPTIONS), OPTIONS)
+    layout = lay_out(camera, natural_grid(camera, PIXEL_LIMIT), PIXEL_LIMIT)
     shown = np.ones((layout.grid.height_px, layout.grid.width_px), bool) if layout.shown is None else layout.shown
     rows, columns = np.nonzero(shown)
     some = slice(None, None, 97)
@@ -159,7 +159,7 @@ def test_shown_is_the_mask_of_the_photographs_pixels(camera: Camera) -> None:
 def test_photographs_of_extreme_shapes_have_a_picture() -> None:
     for width, height in ((16384, 32), (32, 4096)):
         camera = camera_of(width, height)
-        layout = lay_out(camera, natural_grid(camera, OPTIONS), OPTIONS)
+        layout = lay_out(camera, natural_grid(camera, PIXEL_LIMIT), PIXEL_LIMIT)
         picture = layout.picture(np.full((height, width, 3), 200, np.uint8))
         np.testing.assert_allclose(picture, 200 / 255, atol=1e-6)
         assert layout.shown is not None
@@ -169,18 +169,18 @@ def test_photographs_of_extreme_shapes_have_a_picture() -> None:
 def test_a_lens_without_a_visible_field_has_an_empty_picture() -> None:
     """A cut-out from the rim of a fisheye's photograph, with the intrinsics of the whole."""
     camera = Camera(200, 200, 190.0, 190.0, -400.0, 100.0, Fisheye(0.003, 0.0007, -0.002, 0.0002))
-    layout = lay_out(camera, natural_grid(camera, OPTIONS), OPTIONS)
+    layout = lay_out(camera, natural_grid(camera, PIXEL_LIMIT), PIXEL_LIMIT)
     assert layout.shown is not None
     assert not layout.shown.any()
     assert np.ptp(layout.picture(textured(200, 200))) == 0
 
 
 def test_intrinsics_have_half_a_pixel_at_the_first_centre() -> None:
-    layout = lay_out(camera_of(640, 480), Grid(37, 28), OPTIONS)
+    layout = lay_out(camera_of(640, 480), Grid(37, 28), PIXEL_LIMIT)
     np.testing.assert_allclose(layout.intrinsics[:2, 2], [518 / 2, 392 / 2])
     np.testing.assert_allclose(layout.intrinsics[[0, 1], [0, 1]], [0.8 * 518, 0.8 * 640 * 392 / 480])
 
 
 def test_a_photograph_of_another_size_is_refused() -> None:
     with pytest.raises(ValueError, match="does not belong"):
-        lay_out(camera_of(640, 480), Grid(37, 28), OPTIONS).picture(textured(480, 640))
+        lay_out(camera_of(640, 480), Grid(37, 28), PIXEL_LIMIT).picture(textured(480, 640))

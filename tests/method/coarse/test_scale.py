@@ -13,7 +13,8 @@ from support.fake_network import FakeNetwork, FakeNetworkOptions
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rotation_from_vector
-from mapless_server.method.coarse.scale import ScaleOptions, estimate_scale, pairs_of, trajectory_scale
+from mapless_server.method.coarse import scale as stages
+from mapless_server.method.coarse.scale import estimate_scale, pairs_of, trajectory_scale
 from mapless_server.method.features.views import ReconstructedView, Reconstruction
 from mapless_server.method.options import ScaleStrategy
 from mapless_server.method.pairs.correspond import Correspondences
@@ -22,8 +23,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.structure.model import MetricScale, ScaleStage
 
 EXACT = SceneOptions(noise_px=0.0)
-TRIANGULATION = ScaleOptions(strategy=ScaleStrategy.TRIANGULATION)
-TRAJECTORY = ScaleOptions(strategy=ScaleStrategy.TRAJECTORY)
+TRIANGULATION, TRAJECTORY = ScaleStrategy.TRIANGULATION, ScaleStrategy.TRAJECTORY
 CONSISTENTLY_WRONG = FakeNetworkOptions(bad_depth_share=0.7, bad_depth_factors=(1.4, 1.4), depth_noise_m=0.01)
 
 
@@ -40,20 +40,20 @@ def true_matches(scene: SyntheticScene, per_pair: int | None = None) -> Correspo
 def scale_of(
     scene: SyntheticScene,
     network: FakeNetwork,
-    options: ScaleOptions | None = None,
+    strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE,
     matches: Correspondences | None = None,
     metre_sigma: float | None = None,
 ) -> MetricScale:
     predicted = replace(network.reconstruct(scene.query, scene.references), metre_sigma=metre_sigma)
-    outcome = estimate_scale(predicted, scene.references, matches or true_matches(scene), options)
+    outcome = estimate_scale(predicted, scene.references, matches or true_matches(scene), strategy)
     assert isinstance(outcome, MetricScale), outcome
     return outcome
 
 
 def rejection_of(
-    reconstruction: Reconstruction, scene: SyntheticScene, options: ScaleOptions | None = None
+    reconstruction: Reconstruction, scene: SyntheticScene, strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
 ) -> Rejection:
-    outcome = estimate_scale(reconstruction, scene.references, true_matches(scene), options)
+    outcome = estimate_scale(reconstruction, scene.references, true_matches(scene), strategy)
     assert isinstance(outcome, Rejection), outcome
     return outcome
 
@@ -84,7 +84,7 @@ RECONSTRUCTION = FakeNetwork(
 def test_the_scale_is_exact_without_noise(strategy: ScaleStrategy, dense: bool) -> None:
     scene = make_scene(random_for("exact"), EXACT)
     network = FakeNetwork(scene, 1, FakeNetworkOptions(dense=dense))
-    result = scale_of(scene, network, ScaleOptions(strategy=strategy))
+    result = scale_of(scene, network, strategy)
 
     truth = network.world_from_local
     assert result.metres_per_unit == pytest.approx(truth.scale, rel=1e-6)
@@ -121,7 +121,7 @@ def test_wrong_matches_do_not_move_the_median() -> None:
 def test_the_initial_pose_is_as_good_as_the_predicted_poses(strategy: ScaleStrategy) -> None:
     scene = make_scene(random_for("pose noise"))
     network = FakeNetwork(scene, 3, FakeNetworkOptions(depth_noise_m=0.01, pose_noise_m=0.01, pose_noise_deg=0.2))
-    result = scale_of(scene, network, ScaleOptions(strategy=strategy))
+    result = scale_of(scene, network, strategy)
     assert_same_pose(result.world_from_query, scene.world_from_query, metres=0.08, degrees=1.5)
 
 
@@ -142,9 +142,8 @@ def test_the_local_frame_does_not_change_the_result(
             for view in RECONSTRUCTION.references
         ),
     )
-    options = ScaleOptions(strategy=strategy)
-    before = estimate_scale(RECONSTRUCTION, SCENE.references, MATCHES, options)
-    after = estimate_scale(moved, SCENE.references, MATCHES, options)
+    before = estimate_scale(RECONSTRUCTION, SCENE.references, MATCHES, strategy)
+    after = estimate_scale(moved, SCENE.references, MATCHES, strategy)
     assert isinstance(before, MetricScale)
     assert isinstance(after, MetricScale)
     assert (after.stage, after.anchor) == (before.stage, before.anchor)
@@ -195,18 +194,19 @@ def test_a_wrong_trajectory_scale_has_the_larger_deviation() -> None:
     scene = make_scene(random_for("too large"), SceneOptions(reference_count=12, baseline_m=0.1))
     faults = FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.2, 1.2), bad_pose_count=1, bad_pose_m=1.0)
     network = FakeNetwork(scene, 11, faults)
-    first, second, both = (scale_of(scene, network, ScaleOptions(strategy=strategy)) for strategy in ScaleStrategy)
-    assert ScaleOptions().max_deviation < first.deviation < second.deviation
+    first, second, both = (scale_of(scene, network, strategy) for strategy in ScaleStrategy)
+    assert stages.MAX_DEVIATION < first.deviation < second.deviation
     assert (both.stage, both.metres_per_unit) == (ScaleStage.TRIANGULATION, first.metres_per_unit)
 
 
-def test_a_good_triangulated_scale_precedes_a_better_trajectory() -> None:
+def test_a_good_triangulated_scale_precedes_a_better_trajectory(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make_scene(random_for("gate"))
     network = FakeNetwork(scene, 10, FakeNetworkOptions(bad_depth_share=1.0, bad_depth_factors=(1.03, 1.03)))
     both = scale_of(scene, network)
     assert both.stage is ScaleStage.TRIANGULATION
     assert both.deviation == pytest.approx(0.03, abs=0.01)
-    strict = scale_of(scene, network, ScaleOptions(max_deviation=0.01))
+    monkeypatch.setattr(stages, "MAX_DEVIATION", 0.01)
+    strict = scale_of(scene, network)
     assert strict.stage is ScaleStage.TRAJECTORY
     assert strict.deviation < 1e-6
 
@@ -243,26 +243,30 @@ def test_bad_poses_do_not_change_the_trajectory_scale(seed: int) -> None:
     assert result.metres_per_unit == pytest.approx(network.world_from_local.scale, rel=0.02)
 
 
-def test_baselines_out_of_range_are_not_triangulated() -> None:
+def test_baselines_out_of_range_are_not_triangulated(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make_scene(random_for("baselines"), SceneOptions(point_count=200, reference_count=4, baseline_m=0.05))
     network = FakeNetwork(scene, 11)
     assert scale_of(scene, network).stage is ScaleStage.TRAJECTORY
     rejection = rejection_of(network.reconstruct(scene.query, scene.references), scene, TRIANGULATION)
     assert rejection.reason is RejectionReason.SCALE_UNRELIABLE
     assert "0 depths" in rejection.message
-    assert scale_of(scene, network, replace(TRIANGULATION, min_baseline_m=0.04)).metres_per_unit > 0
-    too_far = ScaleOptions(min_baseline_m=0.01, max_baseline_m=0.04)
-    assert scale_of(scene, network, too_far).stage is ScaleStage.TRAJECTORY
+    monkeypatch.setattr(stages, "MIN_BASELINE_M", 0.04)
+    assert scale_of(scene, network, TRIANGULATION).metres_per_unit > 0
+    monkeypatch.setattr(stages, "MIN_BASELINE_M", 0.01)
+    monkeypatch.setattr(stages, "MAX_BASELINE_M", 0.04)
+    assert scale_of(scene, network).stage is ScaleStage.TRAJECTORY
 
 
-def test_distant_points_are_not_triangulated() -> None:
+def test_distant_points_are_not_triangulated(monkeypatch: pytest.MonkeyPatch) -> None:
     # 0.5 m apart and 150 m away: a parallax of 0.2 deg, and depths wrong by a quarter.
     distant = SceneOptions(point_count=200, box_m=(100.0, 60.0, 50.0), distance_m=150.0, reference_count=2)
     scene = make_scene(random_for("distant"), distant)
     network = FakeNetwork(scene, 12)
-    options = ScaleOptions(min_radius_per_depth=0.0, max_deviation=1.0)
-    assert scale_of(scene, network, options).stage is ScaleStage.TRAJECTORY
-    assert scale_of(scene, network, replace(options, min_parallax_deg=0.0)).stage is ScaleStage.TRIANGULATION
+    monkeypatch.setattr(stages, "MIN_RADIUS_PER_DEPTH", 0.0)
+    monkeypatch.setattr(stages, "MAX_DEVIATION", 1.0)
+    assert scale_of(scene, network).stage is ScaleStage.TRAJECTORY
+    monkeypatch.setattr(stages, "MIN_PARALLAX_DEG", 0.0)
+    assert scale_of(scene, network).stage is ScaleStage.TRIANGULATION
 
 
 # Rejections.
@@ -273,8 +277,7 @@ def test_distant_points_are_not_triangulated() -> None:
 def test_references_at_one_place_are_rejected(strategy: ScaleStrategy, pose_noise_m: float) -> None:
     scene = make_scene(random_for("one place"), SceneOptions(point_count=50, baseline_m=1e-3))
     network = FakeNetwork(scene, 14, FakeNetworkOptions(pose_noise_m=pose_noise_m))
-    options = ScaleOptions(strategy=strategy)
-    rejection = rejection_of(network.reconstruct(scene.query, scene.references), scene, options)
+    rejection = rejection_of(network.reconstruct(scene.query, scene.references), scene, strategy)
     assert rejection.reason is RejectionReason.DEGENERATE_REFERENCES
     assert "0.0017 of" in rejection.message
 
@@ -300,7 +303,7 @@ def test_not_finite_is_rejected(strategy: ScaleStrategy) -> None:
         replace(RECONSTRUCTION, references=tuple(infinite)),
         replace(RECONSTRUCTION, references=tuple(behind)),
     ):
-        rejection = rejection_of(broken, SCENE, ScaleOptions(strategy=strategy))
+        rejection = rejection_of(broken, SCENE, strategy)
         assert rejection.reason is RejectionReason.SCALE_UNRELIABLE
 
 
@@ -328,14 +331,14 @@ def test_trajectory_scale_equals_a_plain_implementation() -> None:
             agree = distances[distances <= 0.10]
             rms = float(np.sqrt(np.mean((agree if len(agree) else distances) ** 2)))
             best = max(best, (len(agree), -rms, float(scale)))
-        assert trajectory_scale(predicted, known, pairs_of(7, 32), 0.10) == pytest.approx(best[2])
+        assert trajectory_scale(predicted, known, pairs_of(7, 32)) == pytest.approx(best[2])
 
 
 def test_pairs_predicted_at_one_place_give_no_scale() -> None:
     known = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     predicted = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]])
-    assert trajectory_scale(predicted, known, pairs_of(3, 32), 0.10) in (1.0, 2.0)
-    assert np.isnan(trajectory_scale(np.zeros((3, 3)), known, pairs_of(3, 32), 0.10))
+    assert trajectory_scale(predicted, known, pairs_of(3, 32)) in (1.0, 2.0)
+    assert np.isnan(trajectory_scale(np.zeros((3, 3)), known, pairs_of(3, 32)))
 
 
 def test_trajectory_pairs_are_those_of_evenly_chosen_cameras() -> None:

@@ -281,7 +281,7 @@ def test_halves_move_by_the_steps_of_each_alone() -> None:
         for _ in range(halves_of.LINEAR_STEPS):
             hessian, gradient = np.zeros((6, 6)), np.zeros(6)
             for slope, error in zip(jacobian[half], (residual + jacobian @ motion)[half], strict=True):
-                weight = 1 / (1 + error @ error / halves_of.PNP.loss_scale_px**2)
+                weight = 1 / (1 + error @ error / halves_of.LOSS_SCALE_PX**2)
                 hessian += weight * slope.T @ slope
                 gradient += weight * slope.T @ error
             motion = motion - np.linalg.solve(hessian, gradient)

@@ -17,8 +17,8 @@ from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pairs.correspond import Correspondences, Matcher
-from mapless_server.method.pipeline import Pipeline, StageOptions
-from mapless_server.method.pose.one_reference import OneReferenceOptions
+from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.pose import one_reference
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.structure.model import ScaleSource, ScaleStage
 
@@ -126,31 +126,28 @@ class GivenMatches(Matcher):
         return Correspondences({}, (self._matches,))
 
 
-def answer_to(
-    given: Planted, options: LocalizeOptions | None = None, one_reference: OneReferenceOptions | None = None
-) -> Answer:
-    stages = StageOptions(one_reference=one_reference or OneReferenceOptions())
-    pipeline = Pipeline(PlantedNetwork(given.reconstruction), GivenMatches(given.matches), stages)
+def answer_to(given: Planted, options: LocalizeOptions | None = None) -> Answer:
+    pipeline = Pipeline(PlantedNetwork(given.reconstruction), GivenMatches(given.matches))
     return localize(given.query, [given.reference], pipeline, options or LocalizeOptions())
 
 
-def found(given: Planted, one_reference: OneReferenceOptions | None = None) -> Localization:
-    outcome = answer_to(given, one_reference=one_reference).outcome
+def found(given: Planted) -> Localization:
+    outcome = answer_to(given).outcome
     assert isinstance(outcome, Localization), outcome
     return outcome
 
 
-def test_one_reference_is_enough_within_the_networks_metre() -> None:
+def test_one_reference_is_enough_within_the_networks_metre(monkeypatch: pytest.MonkeyPatch) -> None:
     """The median error is under 4 % of the distance, of the step too, and 68 % radii hold for 60 to 76 %.
 
     A hundred trials, so that the share is known to 5 %. Errors of keypoints and single depths average out here; on
     photographs they do not, which the radii allow for otherwise.
     """
-    independent = OneReferenceOptions(shared_matches=1e9)
+    monkeypatch.setattr(one_reference, "SHARED_MATCHES", 1e9)
     shares, holds = list[tuple[float, float]](), list[bool]()
     for trial in range(100):
         given = planted(random_for("one reference", trial), Errors())
-        answer = found(given, independent)
+        answer = found(given)
         assert answer.covariance is not None
         off = float(np.linalg.norm(answer.world_from_camera.translation - given.world_from_query.translation))
         step = float(np.linalg.norm(given.world_from_query.translation - given.reference.world_from_camera.translation))

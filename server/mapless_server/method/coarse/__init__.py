@@ -64,20 +64,11 @@ class Request:
 
 
 class Reconstructor(Protocol):
-    """A coarse backend.
-
-    Attributes:
-        name: "geometric", "pi3", ...
-        weights_sha256: of the network's weights; empty without any.
-        uses_correspondences: whether the result depends on them. A network's does not, so it runs once for a query,
-            also if other correspondences are tried.
-        is_batched: whether queries are reconstructed together, by the one thread that owns the device; else each query
-            is reconstructed alone, on any thread of the CPU.
-    """
+    """A coarse backend."""
 
     @property
     def name(self) -> str:
-        """Name of the backend."""
+        """Name of the backend: "geometric", "pi3", ..."""
         ...
 
     @property
@@ -87,12 +78,12 @@ class Reconstructor(Protocol):
 
     @property
     def uses_correspondences(self) -> bool:
-        """Whether the result depends on the correspondences."""
+        """Whether the result depends on the correspondences; a network's does not, so it runs once for a query."""
         ...
 
     @property
     def is_batched(self) -> bool:
-        """Whether queries are reconstructed together."""
+        """Whether queries are reconstructed together, by the one thread that owns the device; else on any thread."""
         ...
 
     def close(self) -> None:

@@ -16,7 +16,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from ..bundle.priors import NO_PRIORS, Priors
 from ..features.views import PosedView, ReconstructedView, Reconstruction, View
 from ..pairs.correspond import Correspondences
-from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, format_false_alarms, log10_false_alarms, ransac
+from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, MIN_MATCHES, PnpOptions, format_false_alarms, log10_false_alarms, ransac
 from ..pose.with_priors import informed_pose
 from ..rejection import Rejection, RejectionReason
 from ..structure.kept_depth import with_kept_depths
@@ -67,16 +67,14 @@ class GeometricReconstructor:
         references, correspondences = request.references, request.correspondences
         if correspondences is None:
             raise ValueError(f"{self.name} reconstructs from correspondences, and there are none")
-        rejection = self._check(references)
-        if rejection:
+        if rejection := _check(references):
             return rejection
         structure = triangulated_structure(references, correspondences, STRUCTURE)
         if any(it.depths is not None for it in references):
             structure = with_kept_depths(structure, references, correspondences)
         if not len(structure.x_in_world):
-            return Rejection(
-                RejectionReason.NO_USABLE_REFERENCES, "the references share no points that could be triangulated"
-            )
+            message = "the references share no points that could be triangulated"
+            return Rejection(RejectionReason.NO_USABLE_REFERENCES, message)
         return self._posed(request, structure, correspondences)
 
     def _posed(
@@ -85,7 +83,7 @@ class GeometricReconstructor:
         query, references = request.query, request.references
         matches = vote(structure, [len(r.view.features) for r in references], correspondences)
         seen, priors = matches.seen(query, structure.x_in_world), request.priors
-        enough = len(matches) >= PNP.min_matches
+        enough = len(matches) >= MIN_MATCHES
         pose = ransac(seen, None, PNP) if enough else None
         rejection, inliers = self._judge(query, structure, matches, pose, NO_PRIORS)
         without_priors = rejection
@@ -106,33 +104,31 @@ class GeometricReconstructor:
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
     ) -> tuple[Rejection | None, NDArray[np.bool_]]:
         """Returns the reason to reject the pose, if any, and which of the matches (M,) are its inliers."""
-        inlier_px = PNP.inlier_px
-        if pose is None:
-            message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
-            return _no_overlap(message, matches), np.zeros(len(matches), bool)
-        inliers = matches.seen(query, structure.x_in_world).errors_px(pose) < inlier_px
-        expected = log10_false_alarms(query.camera, matches, inliers, inlier_px) + priors.log10_chance(pose)
-        if expected <= MAX_LOG10_FALSE_ALARMS:
-            return None, inliers
-        message = (
-            f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
-            f" could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
-        )
-        return _no_overlap(message, matches), inliers
+        inliers = np.zeros(len(matches), bool)
+        message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
+        if pose is not None:
+            inliers = matches.seen(query, structure.x_in_world).errors_px(pose) < PNP.inlier_px
+            expected = log10_false_alarms(query.camera, matches, inliers, PNP.inlier_px) + priors.log10_chance(pose)
+            if expected <= MAX_LOG10_FALSE_ALARMS:
+                return None, inliers
+            message = (
+                f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
+                f" could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
+            )
+        return Rejection(RejectionReason.LOW_OVERLAP, message, tried=len(matches)), inliers
 
-    def _check(self, references: Sequence[PosedView]) -> Rejection | None:
-        if len(references) < 2:
-            return Rejection(
-                RejectionReason.NO_USABLE_REFERENCES, f"{len(references)} reference, at least 2 are needed for depth"
-            )
-        centres = np.stack([r.world_from_camera.translation for r in references])
-        extent_m = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
-        if extent_m < MIN_BASELINE_M:
-            return Rejection(
-                RejectionReason.DEGENERATE_REFERENCES,
-                f"all {len(references)} references stand within {extent_m:.3f} m: without a baseline there is no scale",
-            )
-        return None
+
+def _check(references: Sequence[PosedView]) -> Rejection | None:
+    """Rejects references from which no depth can be triangulated."""
+    count = len(references)
+    if count < 2:
+        return Rejection(RejectionReason.NO_USABLE_REFERENCES, f"{count} reference, at least 2 are needed for depth")
+    centres = np.stack([r.world_from_camera.translation for r in references])
+    extent_m = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    if extent_m < MIN_BASELINE_M:
+        message = f"all {count} references stand within {extent_m:.3f} m: without a baseline there is no scale"
+        return Rejection(RejectionReason.DEGENERATE_REFERENCES, message)
+    return None
 
 
 def point_maps(triangulation: Triangulation, query: View, references: Sequence[PosedView]) -> Reconstruction:
@@ -170,7 +166,3 @@ def _map(
     maps.point_map[rows[inside], columns[inside]] = local_from_world.scale * x_in_camera
     maps.confidence[rows[inside], columns[inside]] = 1.0
     return maps
-
-
-def _no_overlap(message: str, matches: PointMatches) -> Rejection:
-    return Rejection(RejectionReason.LOW_OVERLAP, message, tried=len(matches))

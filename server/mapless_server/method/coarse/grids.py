@@ -7,7 +7,7 @@ ratio, so that a reference nearly always has the same one, and its tokens can be
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import cv2
@@ -16,13 +16,29 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mapless.geometry import Array, Camera
-from mapless_server.bounds import check_bounds
 from mapless_server.networks.encoder import PATCH_PX
 
 from ..features.views import Ignored, undistort_pixels
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
-"""Of 518x392."""
+"""Largest number of pixels of a picture: 518x392 for 4:3, a fifth fewer patches than the official loader's 574x434, and
+in the range that the networks were trained on, 100,000 to 255,000; attention over all views is quadratic in it."""
+
+ASPECTS = ((2, 1), (16, 9), (3, 2), (4, 3), (1, 1), (3, 4), (2, 3), (9, 16), (1, 2))
+"""Width to height, over the range that the networks were trained on; within it a photograph's aspect differs from its
+nearest grid's by at most 15 %."""
+
+MAX_STRETCH = 1.16
+"""A photograph whose aspect is the grid's within this factor is resized along each axis separately, as by the official
+loader; another one is fitted inside, its aspect kept, and the rest is filled."""
+
+MAX_DISTORTION_PX = 0.5
+"""A lens that moves no pixel of the picture by more than this is treated as a pinhole: depth is read at the nearest
+pixel, and each resampling costs sharpness."""
+
+MAX_HALF_FIELD_DEG = 50.0
+"""Largest angle between the optical axis and a side of an undistorted picture: the networks were hardly trained beyond
+it, and a pinhole wastes pixels there."""
 
 
 @dataclass(frozen=True)
@@ -48,43 +64,10 @@ class Grid:
         return self.columns / self.rows
 
 
-@dataclass(frozen=True)
-class GridOptions:
-    """Options of the pictures.
-
-    Attributes:
-        pixel_limit: largest number of pixels of a picture. 518x392 for 4:3 has a fifth fewer patches than the official
-            loader's 574x434, and attention over all views is quadratic in them; both lie in the range that the networks
-            were trained on, 100 000 to 255 000 pixels.
-        aspects: width to height, over the range that the networks were trained on. The aspect of a photograph within
-            that range differs from its nearest grid's by at most 15 %.
-        max_stretch: a photograph whose aspect is the grid's within this factor is resized along each axis separately,
-            as by the official loader; another one is fitted inside, its aspect kept, and the rest is filled.
-        max_distortion_px: a lens that moves no pixel of the picture by more than this is treated as a pinhole: depth is
-            read at the nearest pixel, and each resampling costs sharpness.
-        max_half_field_deg: largest angle between the optical axis and a side of an undistorted picture. The networks
-            were hardly trained beyond it, and a pinhole wastes pixels there: at 50 deg one covers 0.4 of the angle of
-            one on the axis.
-    """
-
-    pixel_limit: int = PIXEL_LIMIT
-    aspects: tuple[tuple[int, int], ...] = ((2, 1), (16, 9), (3, 2), (4, 3), (1, 1), (3, 4), (2, 3), (9, 16), (1, 2))
-    max_stretch: float = 1.16
-    max_distortion_px: float = 0.5
-    max_half_field_deg: float = 50.0
-
-    def __post_init__(self) -> None:
-        check_bounds(self, "pixel_limit", at_least=PATCH_PX**2)
-        check_bounds(self, "max_stretch", at_least=1)
-        check_bounds(self, "max_distortion_px", above=0)
-        check_bounds(self, "max_half_field_deg", above=0, below=80)
-        if not self.aspects or not all(width > 0 and height > 0 for width, height in self.aspects):
-            raise ValueError(f"GridOptions.aspects must be pairs of numbers above 0, at least one, is {self.aspects}")
-
-    @cached_property
-    def grids(self) -> tuple[Grid, ...]:
-        """Returns one grid for each aspect."""
-        return tuple(fitted_grid(width, height, self.pixel_limit) for width, height in self.aspects)
+@lru_cache(maxsize=8)
+def _grids(pixel_limit: int) -> tuple[Grid, ...]:
+    """One grid for each aspect."""
+    return tuple(fitted_grid(width, height, pixel_limit) for width, height in ASPECTS)
 
 
 def fitted_grid(width_px: float, height_px: float, pixel_limit: int) -> Grid:
@@ -99,28 +82,28 @@ def fitted_grid(width_px: float, height_px: float, pixel_limit: int) -> Grid:
     return Grid(max(1, columns), max(1, rows))
 
 
-def natural_grid(camera: Camera, options: GridOptions) -> Grid:
+def natural_grid(camera: Camera, pixel_limit: int) -> Grid:
     """Returns the grid whose aspect is nearest to a photograph's, by ratio; the first of equally near ones."""
-    ideal = ideal_camera(camera, options)
+    ideal = ideal_camera(camera, pixel_limit)
     aspect = ideal.width_px / ideal.height_px
-    return min(options.grids, key=lambda grid: abs(math.log(grid.aspect / aspect)))
+    return min(_grids(pixel_limit), key=lambda grid: abs(math.log(grid.aspect / aspect)))
 
 
-def common_grid(cameras: Sequence[Camera], options: GridOptions) -> Grid:
+def common_grid(cameras: Sequence[Camera], pixel_limit: int) -> Grid:
     """Returns the natural grid of most photographs; of equally frequent ones that of the first photograph."""
-    return Counter(natural_grid(camera, options) for camera in cameras).most_common(1)[0][0]
+    return Counter(natural_grid(camera, pixel_limit) for camera in cameras).most_common(1)[0][0]
 
 
 @lru_cache(maxsize=1024)
-def ideal_camera(camera: Camera, options: GridOptions) -> Camera:
+def ideal_camera(camera: Camera, pixel_limit: int) -> Camera:
     """The pinhole that a photograph is undistorted to: the same focal lengths, and the largest field without a gap.
 
     Where distortion does not matter, it is the camera itself as a pinhole. A lens that shows nothing within
-    `max_half_field_deg` gets an empty field of that size.
+    `MAX_HALF_FIELD_DEG` gets an empty field of that size.
     """
-    if not _distortion_matters(camera, options):
+    if not _distortion_matters(camera, pixel_limit):
         return camera.pinhole()
-    left, top, right, bottom = _field(camera, options)
+    left, top, right, bottom = _field(camera)
     return replace(
         camera.pinhole(),
         width_px=max(1, round((right - left) * camera.focal_x_px)),
@@ -130,19 +113,20 @@ def ideal_camera(camera: Camera, options: GridOptions) -> Camera:
     )
 
 
-def _distortion_matters(camera: Camera, options: GridOptions) -> bool:
+def _distortion_matters(camera: Camera, pixel_limit: int) -> bool:
     if camera.distortion is None:
         return False
-    rays = camera.rays(_lattice(camera.width_px, camera.height_px, 17))
+    columns, rows = (np.linspace(-0.5, side - 0.5, 17) for side in (camera.width_px, camera.height_px))
+    rays = camera.rays(np.stack(np.meshgrid(columns, rows), axis=-1))
     moved_px = np.linalg.norm(camera.project(rays) - camera.pinhole().project(rays), axis=-1)
-    scale = math.sqrt(options.pixel_limit / (camera.width_px * camera.height_px))
-    return not moved_px.max() * scale <= options.max_distortion_px
+    scale = math.sqrt(pixel_limit / (camera.width_px * camera.height_px))
+    return not moved_px.max() * scale <= MAX_DISTORTION_PX
 
 
-def _field(camera: Camera, options: GridOptions) -> tuple[float, float, float, float]:
+def _field(camera: Camera) -> tuple[float, float, float, float]:
     """Left, top, right and bottom, at depth 1, of the largest upright rectangle within the field of view."""
     size = np.array([camera.width_px, camera.height_px])
-    limit = math.tan(math.radians(options.max_half_field_deg))
+    limit = math.tan(math.radians(MAX_HALF_FIELD_DEG))
     along = np.linspace(0, 1, 33)
     sides = []
     for axis in (0, 1):
@@ -160,12 +144,6 @@ def _field(camera: Camera, options: GridOptions) -> tuple[float, float, float, f
     return left, top, right, bottom
 
 
-def _lattice(width_px: int, height_px: int, count: int) -> Array:
-    """Evenly spaced pixels (count, count, 2) of an image, from edge to edge."""
-    columns, rows = (np.linspace(-0.5, side - 0.5, count) for side in (width_px, height_px))
-    return np.stack(np.meshgrid(columns, rows), axis=-1)
-
-
 @dataclass(frozen=True, eq=False)
 class Layout:
     """The place of a photograph in a picture of a grid's size.
@@ -175,14 +153,14 @@ class Layout:
         source: the photograph's camera.
         ideal: the pinhole that the photograph is undistorted to.
         box: left, top, width and height, pixels, of the part of the picture that shows the photograph.
-        options: of the pictures.
+        undistorts: whether the lens has distortion that has to be removed.
     """
 
     grid: Grid
     source: Camera
     ideal: Camera
     box: tuple[int, int, int, int]
-    options: GridOptions = field(repr=False)
+    undistorts: bool
 
     @cached_property
     def camera(self) -> Camera:
@@ -196,11 +174,6 @@ class Layout:
             principal_x_px=inside.principal_x_px + left,
             principal_y_px=inside.principal_y_px + top,
         )
-
-    @cached_property
-    def undistorts(self) -> bool:
-        """Whether the lens has distortion that has to be removed."""
-        return _distortion_matters(self.source, self.options)
 
     @cached_property
     def intrinsics(self) -> Array:
@@ -248,42 +221,36 @@ class Layout:
         return np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32) / np.float32(255)
 
     def _undistorted(self, photograph: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Undistorts the photograph, at twice the picture's size, where resampling costs little sharpness."""
-        source, ideal = self._at_twice_the_size()
-        reduced = _resized(photograph, source.width_px, source.height_px)
-        # Outside the photograph its edge is repeated, so that no other colour bleeds into the inside.
-        columns, rows = _lens_map(source, ideal)
-        return np.asarray(cv2.remap(reduced, columns, rows, cv2.INTER_CUBIC, None, cv2.BORDER_REPLICATE), np.uint8)
-
-    def _at_twice_the_size(self) -> tuple[Camera, Camera]:
-        """Source and ideal camera at twice the picture's size; unchanged if the photograph is not larger."""
+        """Undistorts the photograph, at up to twice the picture's size, where resampling costs little sharpness."""
         _, _, width, height = self.box
         scale = min(1.0, max(2 * width / self.ideal.width_px, 2 * height / self.ideal.height_px))
         source, ideal = (
             camera.resized(max(1, round(camera.width_px * scale)), max(1, round(camera.height_px * scale)))
             for camera in (self.source, self.ideal)
         )
-        return source, ideal
+        reduced = _resized(photograph, source.width_px, source.height_px)
+        # Outside the photograph its edge is repeated, so that no other colour bleeds into the inside.
+        columns, rows = _lens_map(source, ideal)
+        return np.asarray(cv2.remap(reduced, columns, rows, cv2.INTER_CUBIC, None, cv2.BORDER_REPLICATE), np.uint8)
 
 
 @lru_cache(maxsize=256)  # with the mask of what is shown, 200 kB each
-def lay_out(camera: Camera, grid: Grid, options: GridOptions) -> Layout:
-    """The layout of a camera's photographs on a grid."""
-    ideal = ideal_camera(camera, options)
+def lay_out(camera: Camera, grid: Grid, pixel_limit: int) -> Layout:
+    """The layout of a camera's photographs on a grid of those with this limit."""
+    ideal = ideal_camera(camera, pixel_limit)
     stretch = math.log(ideal.width_px / ideal.height_px / grid.aspect)
     width, height = grid.width_px, grid.height_px
-    if abs(stretch) > math.log(options.max_stretch):
+    if abs(stretch) > math.log(MAX_STRETCH):
         scale = min(width / ideal.width_px, height / ideal.height_px)
         width, height = max(1, round(ideal.width_px * scale)), max(1, round(ideal.height_px * scale))
     box = ((grid.width_px - width) // 2, (grid.height_px - height) // 2, width, height)
-    return Layout(grid, camera, ideal, box, options)
+    return Layout(grid, camera, ideal, box, _distortion_matters(camera, pixel_limit))
 
 
 def _resized(image: NDArray[np.uint8], width_px: int, height_px: int) -> NDArray[np.uint8]:
     """Resizes an image (H, W, 3) with the filter of the official loader; OpenCV's filters do not antialias.
 
-    Images of more than four times the size are first reduced by averaging to at least twice the size: a third of the
-    time for 12 megapixels, and half a grey level of difference (RMS) on photographs.
+    Images of more than four times the size are first reduced by averaging to at least twice the size, which is faster.
     """
     resized = Image.fromarray(image).resize((width_px, height_px), Image.Resampling.LANCZOS, reducing_gap=2.0)
     return np.asarray(resized, np.uint8)

@@ -36,11 +36,10 @@ def make_reconstructor(
 ) -> Reconstructor:
     """Makes the backend that a setting names: one of `BACKENDS`, or `auto`, on "cpu" or a CUDA device.
 
-    `auto` is a network if its weights are in the folder and there is a CUDA device, on which a query takes a fraction
-    of a second and not minutes as on a CPU; otherwise it is `geometric`, and the reason is logged. A network is
-    compiled for photographs of 4:3, landscape or portrait, with `compiled_views`, the query included, which takes
-    minutes; 0 compiles nothing, and other queries are computed uncompiled. For `query_rays` see NetworkOptions;
-    `answers_queries` says whether queries wait for it, so that a CPU is worth a warning.
+    `auto` is a network if its weights are in the folder and there is a CUDA device; otherwise it is `geometric`, and
+    the reason is logged. A network is compiled for photographs of 4:3, landscape or portrait, with `compiled_views`,
+    the query included, which takes minutes; 0 compiles nothing. For `query_rays` see NetworkOptions; `answers_queries`
+    says whether queries wait for it, so that a CPU is worth a warning.
 
     ValueError for an unknown name; WeightsMissing if the network's weights are not in the folder, with the command that
     fetches them; CheckpointError if they do not fit the network; ImportError if a package that networks need is not
@@ -97,7 +96,6 @@ def _load(
     from .network import NetworkOptions, NetworkReconstructor
 
     options = replace(options or NetworkOptions(), query_rays=query_rays)
-
     known = named(backend)
     with torch.device("meta"):
         network = known.network_class()()
@@ -109,6 +107,6 @@ def _load(
     runner = NetworkRunner(network, backend, weights_sha256, device, compile_backend=compiler)
     if compiled_views:
         log.info("backend %s: compiling for %d views", backend, compiled_views)
-        grids = (fitted_grid(*aspect, options.grids.pixel_limit) for aspect in COMPILED_ASPECTS)
+        grids = (fitted_grid(*aspect, options.pixel_limit) for aspect in COMPILED_ASPECTS)
         runner.warm_up([CompiledShape((grid.rows, grid.columns), compiled_views) for grid in grids])
     return NetworkReconstructor(runner, options)

@@ -21,13 +21,15 @@ import torch
 from torch import Tensor
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.bounds import check_bounds
+from mapless_server.networks.encoder import PATCH_PX
 from mapless_server.networks.network import NetworkOutput
 from mapless_server.networks.runner import NetworkRunner
 
 from ..features.views import Photograph, PosedView, ReconstructedView, Reconstruction, View
 from ..rejection import Rejection, RejectionReason
 from . import Outcome, Request
-from .grids import Grid, GridOptions, Layout, common_grid, lay_out
+from .grids import PIXEL_LIMIT, Grid, Layout, common_grid, lay_out
 from .token_cache import TokenCache, TokenCacheOptions, TokenKey
 
 log = logging.getLogger(__name__)
@@ -40,16 +42,19 @@ class NetworkOptions:
     """Options of a network's backend.
 
     Attributes:
-        grids: of the pictures.
+        pixel_limit: largest number of pixels of a picture.
         cache: of references' tokens.
         query_rays: whether a network that takes intrinsics gets the query's. MapAnything saw hardly any view with
             intrinsics and without a pose among posed ones when it was trained, and few views with neither: which is
             better has to be measured with its weights.
     """
 
-    grids: GridOptions = field(default_factory=GridOptions)
+    pixel_limit: int = PIXEL_LIMIT
     cache: TokenCacheOptions = field(default_factory=TokenCacheOptions)
     query_rays: bool = True
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "pixel_limit", at_least=PATCH_PX**2)
 
 
 class NetworkReconstructor:
@@ -91,11 +96,9 @@ class NetworkReconstructor:
     def reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         """See Reconstructor.reconstruct_many: requests of the same grid and number of references are computed together.
 
-        Each view is encoded once, also if several requests use it. If the device's memory does not suffice, cached
-        tokens are moved from the device, and the failed computation is tried once more. An outcome can be ValueError if
-        a view has no photograph, torch.OutOfMemoryError if the memory does not suffice for this query alone, or
-        RequestError if a reference's photograph cannot be read any more. torch.OutOfMemoryError is raised if the memory
-        does not suffice for so many queries.
+        An outcome can be ValueError if a view has no photograph, torch.OutOfMemoryError if the memory does not suffice
+        for this query alone, or RequestError if a reference's photograph cannot be read any more.
+        torch.OutOfMemoryError is raised if the memory does not suffice for so many queries.
         """
         try:
             return self._reconstruct_many(requests)
@@ -106,7 +109,7 @@ class NetworkReconstructor:
 
     def _reconstruct_many(self, requests: Sequence[Request]) -> list[Outcome | Exception]:
         outcomes: list[Outcome | Exception | None] = [None] * len(requests)
-        batches: dict[tuple[Grid, int], list[tuple[int, _EncodedScene]]] = defaultdict(list)
+        batches: dict[tuple[Grid, int], list[tuple[int, _Scene]]] = defaultdict(list)
         encoded: dict[TokenKey, Tensor] = {}
         for i, request in enumerate(requests):
             if not request.references:
@@ -120,7 +123,7 @@ class NetworkReconstructor:
             except Exception as error:  # an error of one request does not fail the others
                 outcomes[i] = error
             else:
-                batches[scene.grid, len(request.references)].append((i, _EncodedScene(scene, tokens)))
+                batches[scene.grid, len(request.references)].append((i, replace(scene, tokens=tokens)))
         for batch in batches.values():
             indices, scenes = zip(*batch, strict=True)
             for i, outcome in zip(indices, self._with_room(partial(self._run, scenes)), strict=True):
@@ -139,27 +142,23 @@ class NetworkReconstructor:
             torch.cuda.empty_cache()
         return work()
 
-    def _run(self, scenes: Sequence[_EncodedScene]) -> list[Outcome]:
-        """Reconstructs scenes that have the same grid and number of views."""
-        grid, references = scenes[0].scene.grid, scenes[0].scene.references
+    def _run(self, scenes: Sequence[_Scene]) -> list[Outcome]:
+        """Reconstructs encoded scenes that have the same grid and number of views."""
+        grid, references = scenes[0].grid, scenes[0].references
         poses = posed = metric = None
         if self._runner.conditioned:
-            known = np.stack([condition_poses([r.world_from_camera for r in it.scene.references]) for it in scenes])
+            known = np.stack([condition_poses([r.world_from_camera for r in it.references]) for it in scenes])
             poses = torch.from_numpy(known.astype(np.float32))
             posed = (torch.arange(len(references) + 1) < len(references)).repeat(len(scenes), 1)
             # Poses at one place have no size that could be in metres.
-            metric = torch.tensor([it.scene.is_metric for it in scenes]) & poses[:, 1:-1, :3, 3].any(-1).any(-1)
+            metric = torch.tensor([it.is_metric for it in scenes]) & poses[:, 1:-1, :3, 3].any(-1).any(-1)
             metric = metric[:, None].expand_as(posed)
         tokens = torch.stack([of_view for it in scenes for of_view in it.tokens]).unflatten(0, (len(scenes), -1))
         output = self._runner.reconstruct(tokens, (grid.rows, grid.columns), len(references), poses, posed, metric)
-        return [self._outcome(it.scene, output, index) for index, it in enumerate(scenes)]
+        return [self._outcome(it, output, index) for index, it in enumerate(scenes)]
 
     def _encode(self, scene: _Scene, encoded: dict[TokenKey, Tensor]) -> tuple[Tensor, ...]:
-        """Returns the tokens (T, C) of each of a scene's views.
-
-        Views that are not in `encoded` are added to it. Tokens of references are looked up in the cache first;
-        photographs are read only if they are not there.
-        """
+        """Returns the tokens (T, C) of each of a scene's views, and adds those of views that are not in `encoded`."""
         keys = [self._key(view) for view in scene.views]
         for key, view in zip(keys[:-1], scene.views, strict=False):
             if key not in encoded:
@@ -169,7 +168,7 @@ class NetworkReconstructor:
         return tuple(encoded[key] for key in keys)
 
     def _encode_reference(self, key: TokenKey, view: _LaidOut) -> Tensor:
-        """Computes the tokens (T, C) of a reference and caches them for later queries."""
+        """The tokens (T, C) of a reference from the cache, or computed and cached for later queries."""
         tokens = self.cache.get(key)
         if tokens is None:
             tokens = self._encode_view(view)
@@ -234,33 +233,29 @@ class _LaidOut:
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """One request: grid, references, all views with the query last, and whether the unit is the metre."""
+    """One request: grid, references, all views with the query last, and whether the unit is the metre.
+
+    `tokens` (T, C) of each view, once they are encoded, may be shared with other scenes of a batch.
+    """
 
     grid: Grid
     references: Sequence[PosedView]
     views: tuple[_LaidOut, ...]
     is_metric: bool
+    tokens: tuple[Tensor, ...] = ()
 
     @classmethod
     def of(cls, request: Request, options: NetworkOptions) -> _Scene:
         """Makes the scene of a request; raises ValueError if a view has no photograph."""
         references = [_photograph(reference.view, reference.name) for reference in request.references]
         query = _photograph(request.query, "the query")
-        grid = common_grid([photograph.camera for photograph in references], options.grids)
+        grid = common_grid([photograph.camera for photograph in references], options.pixel_limit)
         given_rays = [True] * len(references) + [options.query_rays]
         views = (
-            _LaidOut(photograph, lay_out(photograph.camera, grid, options.grids), given)
+            _LaidOut(photograph, lay_out(photograph.camera, grid, options.pixel_limit), given)
             for photograph, given in zip([*references, query], given_rays, strict=True)
         )
         return cls(grid, request.references, tuple(views), request.is_metric)
-
-
-@dataclass(frozen=True, eq=False)
-class _EncodedScene:
-    """A scene and the tokens (T, C) of each of its views, which other scenes of a batch may share."""
-
-    scene: _Scene
-    tokens: tuple[Tensor, ...]
 
 
 def _photograph(view: View, name: str) -> Photograph:
@@ -287,10 +282,9 @@ def _on_device(tensor: Tensor, device: torch.device) -> Tensor:
 def condition_poses(world_from_references: Sequence[RigidTransform]) -> Array:
     """Poses (K + 1, 4, 4) of the K references, at least one, and of a placeholder for the query, relative to the first.
 
-    Pi3X normalizes by the mean distance of all views from the first, whether their poses are used or not. The
-    placeholder is at the mean distance of the other references, so that it does not change that mean; its direction is
-    arbitrary, since nothing else is computed from it. With a single reference, whose pose is not used, the placeholder
-    is the identity. Differences of world coordinates, which may be large, are taken here, in double precision.
+    Pi3X normalizes by the mean distance of all views from the first, whether their poses are used or not: the
+    placeholder, in an arbitrary direction at the mean distance of the other references, does not change that mean.
+    Differences of world coordinates, which may be large, are taken here, in double precision.
     """
     first = world_from_references[0]
     # Differences first: references at one place are exactly there, which MapAnything's scale depends on.

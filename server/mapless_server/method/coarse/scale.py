@@ -21,13 +21,11 @@ R_align; P_q^init      in `estimate_scale`
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity
-from mapless_server.bounds import check_bounds
 
 from ..features.tracks import keypoint_offsets
 from ..features.views import PosedView, Reconstruction
@@ -38,74 +36,48 @@ from ..rejection import Rejection, RejectionReason
 from ..structure.model import MetricScale, ScaleStage, Structure
 from ..structure.observations import keypoint_depths, keypoint_rays
 
+MIN_BASELINE_M, MAX_BASELINE_M = 0.3, 10.0
+"""Baselines of pairs of references to triangulate, as in the paper. Shorter ones do not determine depth, longer ones
+share few points."""
 
-@dataclass(frozen=True)
-class ScaleOptions:
-    """Options of the scale; "of the paper" marks the paper's values.
+MIN_PARALLAX_DEG = 1.0
+"""Least angle between the two rays of a triangulated match. It gives a depth to 7 % with errors of a pixel at a focal
+length of 800 px. The paper bounds the baseline alone, but 0.3 m does not determine a depth of 100 m."""
 
-    Attributes:
-        strategy: two stages, as in the paper; or one of them alone, for comparison.
-        min_baseline_m, max_baseline_m: baselines of pairs of references to triangulate (of the paper). Shorter ones do
-            not determine depth, longer ones share few points.
-        min_parallax_deg: least angle between the two rays of a triangulated match. The paper bounds the baseline alone,
-            but 0.3 m does not determine a depth of 100 m: one pixel at a focal length of 800 px is 0.07 deg, so an
-            angle of 1 deg gives a depth to 7 %, about the 5 % of `max_deviation`. 0 keeps every match.
-        min_ratios: fewest depth ratios, two per match, for stage 1. The median of 12 matches errs by 1.25 / sqrt(12) of
-            their spread: 3.6 % for a spread of 10 %, within `max_deviation`. With fewer, stage 2 gives the scale.
-        max_matches: largest number of matches to triangulate, evenly thinned: 32 references can have 400 000, but the
-            median of 20 000 errs by less than a hundredth of their spread.
-        max_deviation: deviation below which the scale of stage 1 is adopted at once (of the paper).
-        inlier_distance_m: largest distance between the aligned and the known centre of a camera that is an inlier of a
-            scale of stage 2 (of the paper).
-        max_pair_cameras: stage 2 tries every pair of at most this many cameras, evenly thinned. All 496 pairs of 32
-            replace the paper's 500 random ones, so that an answer is reproducible.
-        min_radius_m: smallest trajectory radius of the references that determines a scale: poses are accurate to about
-            1 cm.
-        min_radius_per_depth: the same for the predicted trajectory, as a share of the scene's depth. At 0.002 the
-            references' images differ by a parallax of 1.6 px at a focal length of 800 px: the noise of a keypoint.
-        max_metre_sigmas: where the reconstruction's unit is approximately the metre (`Reconstruction.metre_sigma`), a
-            stage whose scale differs from 1 by more standard deviations is not used if the other stage's does not. If
-            both differ, both may be used. With 20 %, three are a factor of 1.8.
-    """
+MIN_RATIOS = 24
+"""Fewest depth ratios, two per match, for stage 1: their median errs by 1.25 / sqrt(12) of the spread of 12 matches."""
 
-    strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
-    min_baseline_m: float = 0.3
-    max_baseline_m: float = 10.0
-    min_parallax_deg: float = 1.0
-    min_ratios: int = 24
-    max_matches: int = 20_000
-    max_deviation: float = 0.05
-    inlier_distance_m: float = 0.10
-    max_pair_cameras: int = 32
-    min_radius_m: float = 0.01
-    min_radius_per_depth: float = 0.002
-    max_metre_sigmas: float = 3.0
+MAX_MATCHES = 20_000
+"""Largest number of matches to triangulate, evenly thinned: their median errs by a hundredth of their spread."""
 
-    def __post_init__(self) -> None:
-        check_bounds(self, "min_baseline_m", above=0, at_most=self.max_baseline_m)
-        check_bounds(self, "min_parallax_deg", at_least=0, below=90)
-        check_bounds(self, "min_ratios max_matches", at_least=1)
-        check_bounds(self, "max_deviation min_radius_per_depth", at_least=0)
-        check_bounds(self, "inlier_distance_m min_radius_m", above=0)
-        check_bounds(self, "max_pair_cameras", at_least=2)
-        check_bounds(self, "max_metre_sigmas", above=0)
+MAX_DEVIATION = 0.05
+"""Deviation below which the scale of stage 1 is adopted at once, as in the paper."""
 
-    @property
-    def by_triangulation(self) -> bool:
-        """Whether stage 1 may give the scale."""
-        return self.strategy is not ScaleStrategy.TRAJECTORY
+INLIER_DISTANCE_M = 0.10
+"""Largest distance between the aligned and the known centre of a camera that is an inlier of a scale of stage 2, as in
+the paper."""
 
-    @property
-    def by_trajectory(self) -> bool:
-        """Whether stage 2 may give the scale."""
-        return self.strategy is not ScaleStrategy.TRIANGULATION
+MAX_PAIR_CAMERAS = 32
+"""Stage 2 tries every pair of so many cameras, evenly thinned. All 496 pairs of 32 replace the paper's 500 random ones,
+so that an answer is reproducible."""
+
+MIN_RADIUS_M = 0.01
+"""Smallest trajectory radius of the references that determines a scale: poses are accurate to about 1 cm."""
+
+MIN_RADIUS_PER_DEPTH = 0.002
+"""The same for the predicted trajectory, as a share of the scene's depth: a parallax of 1.6 px at a focal length of
+800 px."""
+
+MAX_METRE_SIGMAS = 3.0
+"""A stage whose scale differs from 1 by more standard deviations (`Reconstruction.metre_sigma`) is not used if the
+other stage's does not."""
 
 
 def estimate_scale(
     reconstruction: Reconstruction,
     references: Sequence[PosedView],
     correspondences: Correspondences,
-    options: ScaleOptions | None = None,
+    strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE,
 ) -> MetricScale | Rejection:
     """Estimates the metric scale of a reconstruction, and with it the query's initial pose; by default as the paper.
 
@@ -114,17 +86,14 @@ def estimate_scale(
     references, DEGENERATE_REFERENCES for references too close to one another, SCALE_UNRELIABLE if the reconstruction is
     not finite or the strategy finds no scale. ValueError if it has another number of references.
     """
-    options, count = options or ScaleOptions(), len(references)
     depth = keypoint_depths(reconstruction, references)
-    rejection = _check_references(references, options) or _check_finite(reconstruction, depth)
+    rejection = _check_references(references) or _check_finite(reconstruction, depth)
     if rejection:
         return rejection
-    known, local = (
-        [it.world_from_camera for it in references],
-        [it.local_from_camera for it in reconstruction.references],
-    )
+    count, known = len(references), [it.world_from_camera for it in references]
+    local = [it.local_from_camera for it in reconstruction.references]
     centres_world, centres = (np.stack([it.translation for it in poses]) for poses in (known, local))
-    rejection = _check_depth(trajectory_radius(centres) / float(np.nanmedian(depth)), count, options)
+    rejection = _check_depth(trajectory_radius(centres) / float(np.nanmedian(depth)), count)
     if rejection:
         return rejection
     confidences = [np.nansum(view.confidence, dtype=np.float64) for view in reconstruction.references]
@@ -132,18 +101,17 @@ def estimate_scale(
     rotation = known[anchor].rotation @ local[anchor].rotation.T  # R_align, which needs no scale
 
     ratios, first, second = np.empty(0), math.nan, math.nan
-    if options.by_triangulation:
-        ratios = triangulated_ratios(references, correspondences, depth, options)
-        first = float(np.median(ratios)) if len(ratios) >= options.min_ratios else math.nan
-    if options.by_trajectory:
-        pairs = pairs_of(count, options.max_pair_cameras)
-        second = trajectory_scale(centres @ rotation.T, centres_world, pairs, options.inlier_distance_m)
+    if strategy is not ScaleStrategy.TRAJECTORY:
+        ratios = triangulated_ratios(references, correspondences, depth)
+        first = float(np.median(ratios)) if len(ratios) >= MIN_RATIOS else math.nan
+    if strategy is not ScaleStrategy.TRIANGULATION:
+        second = trajectory_scale(centres @ rotation.T, centres_world, pairs_of(count, MAX_PAIR_CAMERAS))
     of_first, of_second = (trajectory_deviation(scale, centres, centres_world) for scale in (first, second))
-    by_triangulation = _is_first_better(first, second, of_first, of_second, reconstruction.metre_sigma, options)
+    by_triangulation = _is_first_better(first, second, of_first, of_second, reconstruction.metre_sigma)
     deviation = of_first if by_triangulation else of_second
     scale = first if by_triangulation else second
     if not math.isfinite(scale):
-        return _no_scale(count, len(ratios), options)
+        return _no_scale(count, len(ratios), strategy)
     # x_in_world = t_anc^GT + S R_align (x_in_local - t_anc^local), also of the query: P_q^init.
     shift = known[anchor].translation - scale * (rotation @ local[anchor].translation)
     world_from_local = Similarity(scale, rotation, shift)
@@ -152,17 +120,15 @@ def estimate_scale(
     return MetricScale(scale, stage, deviation, anchor, world_from_local, world_from_query)
 
 
-def _is_first_better(
-    first: float, second: float, of_first: float, of_second: float, metre_sigma: float | None, options: ScaleOptions
-) -> bool:
+def _is_first_better(first: float, second: float, of_first: float, of_second: float, metre_sigma: float | None) -> bool:
     """Whether stage 1 gives the scale, from the scales of both stages and their deviations; NaN without a scale."""
     if metre_sigma is not None:
-        limit = options.max_metre_sigmas * metre_sigma
+        limit = MAX_METRE_SIGMAS * metre_sigma
         first_agrees, second_agrees = (abs(math.log(scale)) <= limit for scale in (first, second))
         if first_agrees != second_agrees:
             return first_agrees
     # Stage 1 if d_tri is below the bound; otherwise the stage with the smaller d, stage 1 of equals.
-    return of_first < options.max_deviation or of_first <= of_second or math.isnan(of_second)
+    return of_first < MAX_DEVIATION or of_first <= of_second or math.isnan(of_second)
 
 
 def network_scale(reconstruction: Reconstruction, reference: PosedView) -> MetricScale | Rejection:
@@ -195,26 +161,25 @@ def known_scale(
     structure: Structure,
     world_from_query: RigidTransform,
     references: Sequence[PosedView],
-    options: ScaleOptions | None = None,
+    strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE,
 ) -> MetricScale | Rejection:
     """The scale of a reconstruction that was triangulated from the known poses, so that it is metric already.
 
     The structure has at least one point, and its tracks the references' order; any strategy finds this scale, of the
-    frame `unit_frame`. The references' places must be within the options' bounds: NO_USABLE_REFERENCES for fewer than
-    two, DEGENERATE_REFERENCES for references too close to one another.
+    frame `unit_frame`. NO_USABLE_REFERENCES for fewer than two references, DEGENERATE_REFERENCES for references too
+    close to one another.
     """
-    options = options or ScaleOptions()
-    rejection = _check_references(references, options)
+    rejection = _check_references(references)
     if rejection:
         return rejection
     poses, tracks = [reference.world_from_camera for reference in references], structure.tracks
     centres, axes = np.stack([it.translation for it in poses]), np.stack([it.rotation[:, 2] for it in poses])
     depth_m = ((structure.x_in_world[tracks.point] - centres[tracks.view]) * axes[tracks.view]).sum(axis=1)
-    rejection = _check_depth(trajectory_radius(centres) / float(np.median(depth_m)), len(references), options)
+    rejection = _check_depth(trajectory_radius(centres) / float(np.median(depth_m)), len(references))
     if rejection:
         return rejection
     frame = unit_frame(poses[0], structure.x_in_world)
-    stage = ScaleStage.TRIANGULATION if options.by_triangulation else ScaleStage.TRAJECTORY
+    stage = ScaleStage.TRAJECTORY if strategy is ScaleStrategy.TRAJECTORY else ScaleStage.TRIANGULATION
     anchor = int(np.bincount(tracks.view).argmax())
     return MetricScale(frame.scale, stage, 0.0, anchor, frame, world_from_query)
 
@@ -225,17 +190,17 @@ def unit_frame(world_from_camera: RigidTransform, x_in_world: Array) -> Similari
     return Similarity(distance_m, world_from_camera.rotation, world_from_camera.translation)
 
 
-def _check_references(references: Sequence[PosedView], options: ScaleOptions) -> Rejection | None:
+def _check_references(references: Sequence[PosedView]) -> Rejection | None:
     """Rejects references at one place: their trajectory radius is 0, so the scale is not determined."""
     count = len(references)
     if count < 2:
         message = f"the scale needs two references at different places, got {count}"
         return Rejection(RejectionReason.NO_USABLE_REFERENCES, message)
     radius_m = trajectory_radius(np.stack([reference.world_from_camera.translation for reference in references]))
-    if not radius_m >= options.min_radius_m:
+    if not radius_m >= MIN_RADIUS_M:
         message = (
             f"{count} references within {radius_m:.2g} of their centroid, in the unit of their poses, "
-            f"{options.min_radius_m:g} needed"
+            f"{MIN_RADIUS_M:g} needed"
         )
         return Rejection(RejectionReason.DEGENERATE_REFERENCES, message)
     return None
@@ -254,30 +219,28 @@ def _check_finite(reconstruction: Reconstruction, depth: Array) -> Rejection | N
     return None
 
 
-def _check_depth(radius_per_depth: float, count: int, options: ScaleOptions) -> Rejection | None:
+def _check_depth(radius_per_depth: float, count: int) -> Rejection | None:
     """Rejects references that are predicted too close to one another for the depth of what they see."""
-    if radius_per_depth >= options.min_radius_per_depth:
+    if radius_per_depth >= MIN_RADIUS_PER_DEPTH:
         return None
     message = (
         f"{count} references predicted within {radius_per_depth:.2g} of the scene's depth of their centroid, "
-        f"{options.min_radius_per_depth:g} needed"
+        f"{MIN_RADIUS_PER_DEPTH:g} needed"
     )
     return Rejection(RejectionReason.DEGENERATE_REFERENCES, message)
 
 
-def _no_scale(count: int, ratio_count: int, options: ScaleOptions) -> Rejection:
+def _no_scale(count: int, ratio_count: int, strategy: ScaleStrategy) -> Rejection:
     message = (
-        f"{ratio_count} depths triangulated between {count} references with baselines of {options.min_baseline_m:g} to "
-        f"{options.max_baseline_m:g} m, {options.min_ratios} needed"
+        f"{ratio_count} depths triangulated between {count} references with baselines of {MIN_BASELINE_M:g} to "
+        f"{MAX_BASELINE_M:g} m, {MIN_RATIOS} needed"
     )
-    if not options.by_triangulation:
+    if strategy is ScaleStrategy.TRAJECTORY:
         message = f"no pair of {count} references has two known and two predicted places"
     return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
 
 
-def triangulated_ratios(
-    references: Sequence[PosedView], correspondences: Correspondences, depth: Array, options: ScaleOptions
-) -> Array:
+def triangulated_ratios(references: Sequence[PosedView], correspondences: Correspondences, depth: Array) -> Array:
     """Ratios (R,) Z^GT / Z^local of triangulated to predicted depths (N,), of matches whose baseline is in range.
 
     A match gives one in either image, so that the order of the references does not matter.
@@ -286,14 +249,14 @@ def triangulated_ratios(
     chosen = [np.empty((0, 2), np.intp)]
     for (i, j), matches in correspondences.reference_pairs.items():
         between = references[j].world_from_camera.translation - references[i].world_from_camera.translation
-        if options.min_baseline_m <= np.linalg.norm(between) <= options.max_baseline_m:
+        if MIN_BASELINE_M <= np.linalg.norm(between) <= MAX_BASELINE_M:
             chosen.append(matches + offsets[[i, j]])
     in_range = np.concatenate(chosen)
-    in_range = in_range[:: 1 + len(in_range) // options.max_matches]
+    in_range = in_range[:: 1 + len(in_range) // MAX_MATCHES]
     centre, ray = keypoint_rays(references)
     depth_m, parallax_deg = triangulate_depths(centre[in_range], ray[in_range])
     # A match behind either camera is wrong. False for NaN.
-    usable = (depth_m > 0).all(axis=1) & (parallax_deg >= options.min_parallax_deg)
+    usable = (depth_m > 0).all(axis=1) & (parallax_deg >= MIN_PARALLAX_DEG)
     ratios = (depth_m[usable] / depth[in_range[usable]]).ravel()
     return np.asarray(ratios[np.isfinite(ratios)])
 
@@ -314,20 +277,12 @@ def trajectory_deviation(metres_per_unit: float, centres: Array, centres_world: 
     return abs(metres_per_unit * trajectory_radius(centres) / trajectory_radius(centres_world) - 1)
 
 
-def trajectory_scale(aligned: Array, centres_world: Array, pairs: NDArray[np.intp], inlier_distance_m: float) -> float:
-    """S_traj: the scale with the most inliers, of equals that with the smallest RMS distance.
+def trajectory_scale(aligned: Array, centres_world: Array, pairs: NDArray[np.intp]) -> float:
+    """S_traj, metres per unit: the scale with the most inliers, of equals that with the smallest RMS distance.
 
-    Every pair of cameras proposes the ratio of their known to their predicted distance. The predicted trajectory is
-    scaled by it and shifted so that its centroid is that of the known one; cameras near their known centre are inliers.
-
-    Args:
-        aligned: (K, 3) predicted centres in world axes, R_align C^local.
-        centres_world: (K, 3) known centres, metres.
-        pairs: (P, 2) pairs of cameras, at least one.
-        inlier_distance_m: largest distance of an inlier.
-
-    Returns:
-        Metres per unit; NaN when no pair has a distance in both trajectories.
+    Every pair (P, 2) of cameras proposes the ratio of their known to their predicted distance. The predicted centres in
+    world axes, R_align C^local (K, 3), are scaled by it and shifted so that their centroid is that of the known ones
+    (K, 3), metres; cameras near their known centre are inliers. NaN when no pair has a distance in both trajectories.
     """
     predicted, known = (
         np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1) for centres in (aligned, centres_world)
@@ -339,7 +294,7 @@ def trajectory_scale(aligned: Array, centres_world: Array, pairs: NDArray[np.int
     proposals = known[apart] / predicted[apart]
     moved = proposals[:, None, None] * (aligned - aligned.mean(0))  # (P, K, 3)
     squared = ((moved - (centres_world - centres_world.mean(0))) ** 2).sum(2)  # (P, K) square metres
-    inliers = squared <= inlier_distance_m**2
+    inliers = squared <= INLIER_DISTANCE_M**2
     count = inliers.sum(1)
     counted = inliers | (count == 0)[:, None]  # all cameras, where none is an inlier
     mean_squared = (squared * counted).sum(1) / counted.sum(1)

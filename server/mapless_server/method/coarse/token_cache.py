@@ -43,11 +43,9 @@ class TokenCacheOptions:
     """Options of the cache; tokens of one view are 2.1 MB at 518x392 in bfloat16, MapAnything's 3.2; twice in float32.
 
     Attributes:
-        device_bytes: on the device; 1 GiB are 500 views in bfloat16 (337 of MapAnything), enough for a scene and little
-            beside the weights.
-        host_bytes: in the host's memory, for tokens that have no room on the device: another 1000 views. Copying those
-            of a view to the device moves 2.1 MB; computing them takes 0.8 TFLOP, MapAnything's 1.6. For CUDA the memory
-            is pinned, whose blocks have sizes of powers of two: at 518x392 nearly twice as much is taken.
+        device_bytes: on the device; 1 GiB are 500 views, enough for a scene and little beside the weights.
+        host_bytes: in the host's memory, for tokens that have no room on the device. For CUDA it is pinned, in blocks
+            whose sizes are powers of two: at 518x392 nearly twice as much is taken.
     """
 
     device_bytes: int = 2**30

@@ -14,7 +14,7 @@ from mapless.geometry import Array, RigidTransform, cross_matrix
 from ..bundle.priors import PriorCheck
 from ..optim.optimize import covariance_in_world, perturbed
 from ..pose.generalized import inlier_count, rig_ransac
-from ..pose.pnp import PnpOptions
+from ..pose.pnp import MIN_MATCHES, PnpOptions
 from ..rejection import Rejection, RejectionReason
 from .images import (
     GroupImage,
@@ -29,7 +29,7 @@ from .joint import adjust_in_rounds
 from .trust import trust_of_group
 
 PNP = PnpOptions()
-"""Options of the pose solver; `min_matches` holds for all cameras together."""
+"""Options of the pose solver; `MIN_MATCHES` holds for all cameras together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +129,8 @@ def _start(
     """Returns the pose with most inliers, from generalized PnP or from the own pose of an image."""
     cameras = [it.camera_matches(rig_from_camera[it.image]) for it in matched_images]
     total = sum(map(len, cameras))
-    if total < PNP.min_matches:
-        message = f"{total} 2D-3D matches in {len(cameras)} images, {PNP.min_matches} needed"
+    if total < MIN_MATCHES:
+        message = f"{total} 2D-3D matches in {len(cameras)} images, {MIN_MATCHES} needed"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
     found = rig_ransac(cameras, PNP)
     candidates = [] if found is None else [found]

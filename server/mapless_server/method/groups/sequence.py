@@ -22,6 +22,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from ..bundle.priors import PriorCheck, Priors
 from ..judge.evidence import findable_count
 from ..optim.optimize import covariance_in_world
+from ..pose.pnp import MIN_MATCHES
 from ..rejection import Rejection, RejectionReason
 from .drift import SequenceState, world_from_session_at
 from .images import (
@@ -35,7 +36,7 @@ from .images import (
 )
 from .joint import JointEstimate, adjust_in_rounds
 from .jumps import Jump
-from .start import LOOSE_PX, PNP, Session, Start
+from .start import LOOSE_PX, Session, Start
 from .trust import trust_of_group
 
 SHOULD_SHOW, LEAST_NEAR = 15, 3
@@ -101,8 +102,8 @@ def solve_sequence(
     if estimate_scale and not session.moves:
         return Rejection(RejectionReason.SCALE_UNRELIABLE, "the session does not move: its unit cannot be determined")
     total = sum(len(it.tracked) for it in matched_images)
-    if total < PNP.min_matches:
-        message = f"{total} 2D-3D matches in {len(matched_images)} frames, {PNP.min_matches} needed"
+    if total < MIN_MATCHES:
+        message = f"{total} 2D-3D matches in {len(matched_images)} frames, {MIN_MATCHES} needed"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
     found = _estimated(matched_images, session)
     if isinstance(found, Rejection):

@@ -31,7 +31,7 @@ CHECK_TRACKING = Hint(
 
 
 PNP = PnpOptions()
-"""Options of the pose solvers; `min_matches` holds for all frames together."""
+"""Options of the pose solvers; `MIN_MATCHES` holds for all frames together."""
 
 LOOSE_PX = 12.0
 """Inlier bound for initial guesses, which drift."""

@@ -207,7 +207,7 @@ class _Compared:
             pose = find_pose(all_matches, LINES)
         elif pose is None:
             pose = ransac(all_matches.points, None, PNP)
-        return 0.0 if pose is None else score(all_matches, pose, LINES)
+        return 0.0 if pose is None else score(all_matches, pose)
 
     def scored(self, camera: Camera) -> tuple[float, Camera]:
         """A camera with its score, comparable with that of the given camera's pose."""

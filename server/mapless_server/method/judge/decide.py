@@ -22,7 +22,7 @@ from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from ..bundle.estimate import Support, accuracy_from_covariance
 from ..bundle.priors import Priors
 from ..pose import relative
-from ..pose.relative import RelativePoseOptions
+from ..pose.pnp import disc_chance
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .answer import Localization
@@ -208,12 +208,12 @@ class _Scored:
 
     def score(self, world_from_camera: RigidTransform) -> float:
         """The score of a pose in the caller's world, see `pose.relative`."""
-        pose, options = world_from_camera.shifted(-self.origin), RelativePoseOptions()
-        errors = np.nan_to_num(self.votes.seen.errors_px(pose) / options.pnp.inlier_px, nan=np.inf)
+        pose, inlier_px = world_from_camera.shifted(-self.origin), relative.PNP.inlier_px
+        errors = np.nan_to_num(self.votes.seen.errors_px(pose) / inlier_px, nan=np.inf)
         best = np.zeros(len(self.lines.query.features))
         np.maximum.at(best, self.votes.keypoint, np.clip(1 - errors**2, 0, None))
-        disc = relative.disc_chance(self.lines.query.camera, options.pnp.inlier_px)
-        return relative.score(self.lines, pose, options) - float(np.log10(disc) * best.sum())
+        disc = disc_chance(self.lines.query.camera, inlier_px)
+        return relative.score(self.lines, pose) - float(np.log10(disc) * best.sum())
 
 
 def _matches(found: Sequence[Found]) -> Iterator[_Scored]:

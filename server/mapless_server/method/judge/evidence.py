@@ -24,8 +24,8 @@ from mapless.geometry import Array, RigidTransform
 from ..bundle.estimate import PosedSupport, Support
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import cauchy_weight, pose_jacobian
-from ..pose.pnp import PnpOptions, ransac
-from ..pose.two_view_matches import TwoViewMatches
+from ..pose.pnp import LOSS_SCALE_PX, PnpOptions, ransac
+from ..pose.two_view_matches import EPIPOLAR_PX, TwoViewMatches
 from ..structure.model import PixelPoints, PointMatches, Structure
 
 MOST_POINTS = 2000
@@ -33,9 +33,6 @@ MOST_POINTS = 2000
 
 LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
 """Below these evidence is not better or worse. A right pose's halves are apart by a thousandth of the distance."""
-
-EPIPOLAR_PX = 2.0
-"""Largest Sampson distance of a match that agrees with a pose; keypoints are accurate to about a pixel."""
 
 MAJORITY, LEAST_AGREEING = 0.5, 8
 """Where a larger share of a half's matches agree with the pose, and so many, the half's own pose is near it."""
@@ -207,7 +204,7 @@ def _shifts_nearby(seen: PixelPoints, halves: NDArray[np.bool_], pose: RigidTran
     largest = LINEAR_SHARE * np.repeat([distance_m, 1.0], 3)
     for _ in range(LINEAR_STEPS):
         of_motion = np.concatenate([motion[:, ROW] * motion[:, COLUMN] * TWICE, 2 * motion], axis=1)
-        weight = in_half * cauchy_weight(squared + of_motion @ products, PNP.loss_scale_px)
+        weight = in_half * cauchy_weight(squared + of_motion @ products, LOSS_SCALE_PX)
         sums = weight @ products.T
         hessian = np.empty((len(sums), 6, 6))
         hessian[:, ROW, COLUMN] = hessian[:, COLUMN, ROW] = sums[:, :-6]

@@ -43,7 +43,7 @@ from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance
 from ..bundle.intrinsics import ContradictionOptions
 from ..features.views import Matches
 from ..optim.optimize import pose_hessian, world_covariance
-from ..pose.pnp import PnpOptions, false_alarms, ransac
+from ..pose.pnp import PnpOptions, disc_chance, false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .cameras import wrong_camera, wrong_intrinsics
 from .evidence import Evidence, Votes, evidence_of, votes_of
@@ -283,8 +283,7 @@ def _second_pose(camera: Camera, votes: Votes, wanted: int) -> tuple[RigidTransf
     inliers = votes.seen.errors_px(pose) < RIVAL_PNP.inlier_px
     keypoint_count, count = len(np.unique(votes.keypoint)), votes.keypoint_count(inliers)
     # The chance of an inlier is proportional to the number of matches of a keypoint.
-    disc_share = np.pi * RIVAL_PNP.inlier_px**2 / (camera.width_px * camera.height_px)
-    chance = float(disc_share * len(votes.keypoint) / keypoint_count)
+    chance = float(disc_chance(camera, RIVAL_PNP.inlier_px) * len(votes.keypoint) / keypoint_count)
     if count < wanted or false_alarms(keypoint_count, count, chance) > RIVAL_MAX_LOG10_FALSE_ALARMS:
         return None
     # With a keypoint noise of one pixel.

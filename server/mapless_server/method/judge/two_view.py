@@ -22,9 +22,9 @@ import numpy as np
 from ..bundle.estimate import PosedSupport, TwoViewSupport
 from ..features.views import Matches
 from ..pairs.stationary import StationaryOptions, are_moved
-from ..pose.pnp import false_alarms, format_false_alarms, log10_tail
-from ..pose.relative import band_chance, disc_chance
-from ..pose.two_view_matches import TwoViewMatches
+from ..pose.pnp import disc_chance, false_alarms, format_false_alarms, log10_tail
+from ..pose.relative import PNP, band_chance
+from ..pose.two_view_matches import EPIPOLAR_PX, TwoViewMatches
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .evidence import hull_px2
 from .references import moved_matches
@@ -47,9 +47,6 @@ LEVELS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
 
 MIN_HULL_SHARE = 0.04
 """Least share of the image covered by the convex hull of the inliers; see `groups.images`."""
-
-INLIER_PX, EPIPOLAR_PX = 4.0, 2.0
-"""Largest reprojection error, and largest Sampson distance, of an inlier."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,7 @@ def two_view_evidence(support: PosedSupport, query_matches: Sequence[Matches]) -
     estimate, lines, matches, camera = support.estimate, support.two_view, support.matches, support.query.camera
     if lines is None:
         raise ValueError("support.two_view must not be None")
-    disc, band = disc_chance(camera, INLIER_PX), band_chance(camera, EPIPOLAR_PX)
+    disc, band = disc_chance(camera, PNP.inlier_px), band_chance(camera)
     # Matches searched near a pose agree with it by construction.
     points = int((~matches.guided).sum()), int((estimate.inliers & ~matches.guided).sum())
     all_lines = len(lines.inliers), int(lines.inliers.sum())

@@ -23,7 +23,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..features.views import Rows
 from ..structure.model import PixelPoints
-from .pnp import PnpOptions, poselib_camera, poselib_pose
+from .pnp import REFINEMENT, PnpOptions, inverse_of, iterations_between, poselib_camera, poselib_pose
 
 _libc = ctypes.CDLL(None)
 _rand_lock = threading.Lock()
@@ -67,10 +67,7 @@ def inlier_count(
 
 
 def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTransform | None:
-    """Estimates `world_from_rig` by gp3p in RANSAC with a final Cauchy refinement; None without a finite pose.
-
-    The same matches give the same pose.
-    """
+    """Estimates `world_from_rig` by gp3p in RANSAC with a final Cauchy refinement; None without a finite pose."""
     cameras = _bounded(cameras, options.max_matches)
     if sum(len(camera) for camera in cameras) < 3:
         return None
@@ -82,13 +79,11 @@ def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTr
             [poselib_camera(camera.seen.camera) for camera in cameras],
             {
                 "max_reproj_error": options.inlier_px,
-                "min_iterations": options.min_iterations,
-                "max_iterations": options.max_iterations,
-                "seed": 0,
+                **iterations_between(options.min_iterations, options.max_iterations),
             },
-            {"loss_type": "CAUCHY", "loss_scale": options.loss_scale_px},
+            REFINEMENT,
         )
-    return _world_from_rig(pose)
+    return inverse_of(pose)
 
 
 def scaled_ransac(
@@ -96,10 +91,9 @@ def scaled_ransac(
 ) -> Similarity | None:
     """Estimates the similarity `world_from_rig` by gp4ps in our own RANSAC; PoseLib has the solver, but no estimator.
 
-    `rig_from_camera` of the cameras is in any common unit. Poses are scored on at most `max_matches`, thinned evenly;
-    fewer than `max_iterations` samples are taken if a pose has many inliers. Returns the pose with the most inliers;
-    None if there is none. A scale that is not above zero, or not determined because all cameras are at one place, is no
-    pose.
+    `rig_from_camera` of the cameras is in any common unit. Poses are scored on at most `max_matches`, thinned evenly.
+    Returns the pose with the most inliers; None if there is none with a scale above zero, which cameras at one place do
+    not determine.
     """
     cameras = _bounded(cameras, max_matches)
     rays = np.concatenate([_rays(camera) for camera in cameras])
@@ -132,7 +126,7 @@ def scaled_ransac(
 def _repeatable() -> Iterator[None]:
     """Makes PoseLib's generalized solvers repeatable: they rotate the problem by random numbers of the C library.
 
-    PoseLib's seed does not apply to these numbers: the same matches would give poses that differ in the last digits.
+    PoseLib's seed does not apply to these numbers.
     """
     with _rand_lock:
         _libc.srand(0)
@@ -157,14 +151,7 @@ def _rays(camera: CameraMatches) -> Array:
 
 
 def _similarity(pose: poselib.CameraPose, scale: float) -> Similarity | None:
-    world_from_rig = _world_from_rig(pose)
+    world_from_rig = inverse_of(pose)
     if world_from_rig is None or not (math.isfinite(scale) and scale > 0):
         return None
     return Similarity(scale, world_from_rig.rotation, world_from_rig.translation)
-
-
-def _world_from_rig(pose: poselib.CameraPose) -> RigidTransform | None:
-    rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        return None
-    return RigidTransform(rotation, translation).inverse()

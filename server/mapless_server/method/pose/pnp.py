@@ -1,11 +1,10 @@
 """Pose from 2D-3D matches: RANSAC and Levenberg-Marquardt; and the gate, which rejects poses that chance could support.
 
 As in the paper, the refined pose replaces the initial one only if it has at least as many inliers. Priors add
-candidates, and terms in the cost (see `informed`).
+candidates, and terms in the cost (see `with_priors`).
 
-A pose must have more inliers than wrong matches can be expected to give (a-contrario model estimation, Moisan and
-Stival 2004). This gate is a cheap first test, which means the same for every scene; wrong matches of repeated texture
-agree with one another and pass it. `judge` computes the trust of poses that pass.
+The gate: a pose must have more inliers than wrong matches can be expected to give (a-contrario model estimation, Moisan
+and Stival 2004). Wrong matches of repeated texture agree with one another and pass it; `judge` rejects these.
 """
 
 from dataclasses import dataclass, replace
@@ -28,7 +27,16 @@ from .with_priors import informed_pose
 
 SAMPLE, SAMPLE_INLIERS, SAMPLE_ITERATIONS = 80, 32, 300
 """Matches that RANSAC sees first, the least inliers among them, and the largest number of iterations: so many find a
-pose with that share of inliers, but for one case in 10^8. All of 600 matches take three times as long."""
+pose with that share of inliers, but for one case in 10^8."""
+
+MIN_MATCHES = 6
+"""Fewer give no pose."""
+
+LOSS_SCALE_PX = 1.0
+"""Scale of the Cauchy loss in PoseLib's refinements; about the error of a good keypoint."""
+
+REFINEMENT = {"loss_type": "CAUCHY", "loss_scale": LOSS_SCALE_PX}
+"""PoseLib's options of the refinement after RANSAC. PoseLib silently ignores options that it does not know."""
 
 MAX_LOG10_FALSE_ALARMS = -3.0
 """Largest log10 of the expected number of poses with as many inliers among wrong matches."""
@@ -43,24 +51,19 @@ class PnpOptions:
 
     Attributes:
         inlier_px: largest reprojection error of an inlier.
-        loss_scale_px: scale of the Cauchy loss in the final refinement; about the error of a good keypoint.
         min_iterations: least number of RANSAC iterations; enough with an initial pose.
         max_iterations: largest number of RANSAC iterations, reached with 5 % inliers.
         max_matches: largest number of matches, evenly thinned; more are not more accurate, and scoring is linear in it.
-        min_matches: fewer give no pose.
     """
 
     inlier_px: float = 4.0
-    loss_scale_px: float = 1.0
     min_iterations: int = 100
     max_iterations: int = 20_000
     max_matches: int = 2000
-    min_matches: int = 6
 
     def __post_init__(self) -> None:
-        check_bounds(self, "inlier_px loss_scale_px", above=0)
+        check_bounds(self, "inlier_px", above=0)
         check_bounds(self, "min_iterations", above=0, at_most=self.max_iterations)
-        check_bounds(self, "min_matches", at_least=4)
 
 
 def solve_pose(
@@ -73,19 +76,17 @@ def solve_pose(
 ) -> PoseEstimate | Rejection:
     """Estimates the query's pose from its matches with the structure.
 
-    Returns:
-        The refined or the initial pose, whichever has more inliers (the refined one on a tie); or a better candidate
-        from priors, refined with the consistent priors. Or a rejection: TOO_FEW_MATCHES; PNP_FAILED if no pose has four
-        inliers.
+    Returns the refined or the initial pose, whichever has more inliers (the refined one on a tie); or a better
+    candidate from priors, refined with the consistent priors. Or a rejection: TOO_FEW_MATCHES; PNP_FAILED if no pose
+    has four inliers.
     """
-    if len(matches) < options.min_matches:
-        return Rejection(RejectionReason.TOO_FEW_MATCHES, f"{len(matches)} 2D-3D matches, {options.min_matches} needed")
+    if len(matches) < MIN_MATCHES:
+        return Rejection(RejectionReason.TOO_FEW_MATCHES, f"{len(matches)} 2D-3D matches, {MIN_MATCHES} needed")
     seen = matches.seen(query, structure.x_in_world)
     refined = ransac(seen, world_from_query_initial, options)
     candidates = [(PoseStage.REFINED, refined)] if refined else []
     candidates.append((PoseStage.INITIAL, world_from_query_initial))
-    inlier_counts = [(seen.errors_px(pose) < options.inlier_px).sum() for _, pose in candidates]
-    stage, pose = candidates[int(np.argmax(inlier_counts))]
+    stage, pose = max(candidates, key=lambda it: seen.inlier_count(it[1], options.inlier_px))
     if not priors:
         return _estimate(seen, stage, pose, options)
     informed = informed_pose(seen, pose, priors, options.inlier_px)
@@ -130,40 +131,36 @@ def ransac(seen: PixelPoints, world_from_camera: RigidTransform | None, options:
     pose = None
     if len(seen) >= 2 * SAMPLE:
         sample = np.arange(SAMPLE) * len(seen) // SAMPLE
-        pose, count = _ransac(seen[sample], initial, options, SAMPLE_ITERATIONS, 0)
+        brief = replace(
+            options,
+            min_iterations=min(options.min_iterations, SAMPLE_ITERATIONS),
+            max_iterations=min(options.max_iterations, SAMPLE_ITERATIONS),
+        )
+        pose, count = _ransac(seen[sample], initial, brief, refinement_steps=0)
         pose = _refined(seen, pose, options) if count >= SAMPLE_INLIERS else None
     if pose is None:
-        pose, _ = _ransac(seen, initial, options, options.max_iterations)
-    rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        return None
-    return RigidTransform(rotation, translation).inverse()
+        pose, _ = _ransac(seen, initial, options, refinement_steps=100)
+    return inverse_of(pose)
 
 
 def _ransac(
-    seen: PixelPoints,
-    initial: poselib.CameraPose | None,
-    options: PnpOptions,
-    max_iterations: int,
-    refinement_steps: int = 100,
+    seen: PixelPoints, initial: poselib.CameraPose | None, options: PnpOptions, refinement_steps: int
 ) -> tuple[poselib.CameraPose, int]:
-    """PoseLib's RANSAC: the pose, and its number of inliers. PoseLib silently ignores options that it does not know."""
-    ransac_options = {
-        "max_reproj_error": options.inlier_px,
-        "min_iterations": min(options.min_iterations, max_iterations),
-        "max_iterations": min(options.max_iterations, max_iterations),
-        "seed": 0,
-    }
-    camera, refinement = poselib_camera(seen.camera), _refinement(options, refinement_steps)
+    """PoseLib's RANSAC: the pose, and its number of inliers."""
     pose, found = poselib.estimate_absolute_pose(
-        seen.pixels, seen.x_in_world, camera, ransac_options, refinement, initial
+        seen.pixels,
+        seen.x_in_world,
+        poselib_camera(seen.camera),
+        {"max_reproj_error": options.inlier_px, **iterations_between(options.min_iterations, options.max_iterations)},
+        {**REFINEMENT, "max_iterations": refinement_steps},
+        initial,
     )
     return pose, int(found.get("num_inliers", 0))
 
 
 def _refined(seen: PixelPoints, pose: poselib.CameraPose, options: PnpOptions) -> poselib.CameraPose:
     """Refines a pose by its inliers, twice: at a pose that rests on a sample some are missing."""
-    camera, refinement = poselib_camera(seen.camera), _refinement(options, REFINEMENT_STEPS)
+    camera, refinement = poselib_camera(seen.camera), {**REFINEMENT, "max_iterations": REFINEMENT_STEPS}
     for thinning in (2, 1):
         some = seen[::thinning]
         off = seen.camera.project(some.x_in_world @ np.asarray(pose.R).T + np.asarray(pose.t)) - some.pixels
@@ -172,8 +169,9 @@ def _refined(seen: PixelPoints, pose: poselib.CameraPose, options: PnpOptions) -
     return pose
 
 
-def _refinement(options: PnpOptions, steps: int) -> dict[str, object]:
-    return {"loss_type": "CAUCHY", "loss_scale": options.loss_scale_px, "max_iterations": steps}
+def iterations_between(least: int, most: int) -> dict[str, int]:
+    """PoseLib's options of a RANSAC with so many iterations; its samples are always the same."""
+    return {"min_iterations": least, "max_iterations": most, "seed": 0}
 
 
 def poselib_camera(camera: Camera) -> dict[str, object]:
@@ -194,6 +192,14 @@ def poselib_pose(target_from_source: RigidTransform) -> poselib.CameraPose:
     return pose
 
 
+def inverse_of(pose: poselib.CameraPose) -> RigidTransform | None:
+    """The inverse of a pose in PoseLib's form; None if it is not finite."""
+    rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
+        return None
+    return RigidTransform(rotation, translation).inverse()
+
+
 def gate_failure(
     camera: Camera,
     matches: PointMatches,
@@ -203,12 +209,8 @@ def gate_failure(
 ) -> str | None:
     """Says in one sentence why a pose fails the gate; None if it passes.
 
-    Args:
-        camera: camera of the photograph.
-        matches: matches of the photograph with the points of a structure.
-        inliers: (M,) which of them are inliers of the pose; at least four.
-        inlier_px: largest reprojection error of an inlier.
-        log10_chance: see `Priors.log10_chance`.
+    At least four of the matches with points are `inliers` (M,) of the pose, with errors up to `inlier_px`. For
+    `log10_chance` see `Priors.log10_chance`.
     """
     expected = log10_false_alarms(camera, matches, inliers, inlier_px) + log10_chance
     if expected <= MAX_LOG10_FALSE_ALARMS:
@@ -232,14 +234,15 @@ def log10_false_alarms(camera: Camera, matches: PointMatches, inliers: NDArray[n
     )
 
 
-def false_alarms(match_count: int, inlier_count: int, chance: float, sample: int = 3) -> float:
-    """Log10 of (n - m) C(n, k) C(k, m) p^(k - m): at least k of n matches agree with a pose through m of them.
+def disc_chance(camera: Camera, inlier_px: float) -> float:
+    """Chance that a wrong match lies within `inlier_px` of a point's projection: a disc's share of the image."""
+    return float(min(1.0, np.pi * inlier_px**2 / (camera.width_px * camera.height_px)))
 
-    Args:
-        match_count: n.
-        inlier_count: k.
-        chance: p, the probability that a wrong match agrees.
-        sample: m, the number of matches that determine a pose.
+
+def false_alarms(match_count: int, inlier_count: int, chance: float, sample: int = 3) -> float:
+    """log10 of (n - m) C(n, k) C(k, m) p^(k - m): k or more of n matches agree with a pose through a `sample` of m.
+
+    p is the chance that a wrong match agrees.
     """
     n, k, m = match_count, inlier_count, sample
     if k <= m or chance >= 1:

@@ -13,7 +13,7 @@ is an inlier: an epipolar line excludes less of the image than a point, so such 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import poselib
@@ -24,8 +24,27 @@ from mapless_server.bounds import check_bounds
 
 from ..features.views import PosedView, View
 from ..structure.model import PixelPoints
-from .pnp import PnpOptions, poselib_camera, poselib_pose, ransac
-from .two_view_matches import TwoViewMatches
+from .pnp import (
+    MIN_MATCHES,
+    REFINEMENT,
+    PnpOptions,
+    disc_chance,
+    inverse_of,
+    iterations_between,
+    poselib_camera,
+    poselib_pose,
+    ransac,
+)
+from .two_view_matches import EPIPOLAR_PX, TwoViewMatches
+
+PNP = PnpOptions()
+"""Options of poses from 2D-3D matches, and the bound of their inliers."""
+
+MIN_PAIR_MATCHES = 8
+"""Least number of matches with a reference, for its relative pose."""
+
+MAX_DISTANCES = 200
+"""Largest number of distances that are scored for each reference, evenly thinned."""
 
 
 @dataclass(frozen=True)
@@ -33,29 +52,19 @@ class RelativePoseOptions:
     """Options of the search.
 
     Attributes:
-        epipolar_px: largest Sampson distance of an inlier; keypoints are accurate to about a pixel.
-        pnp: options of poses from 2D-3D matches; its `inlier_px` bounds their inliers.
         min_iterations, max_iterations: bounds of iterations for the generalized relative pose; 20,000 take 0.1 s.
         pair_iterations: largest number of iterations for one reference, reached with 15 % inliers.
         strongest: number of references whose relative pose is computed.
-        min_matches: least number of matches with a reference, for its relative pose.
-        max_distances: largest number of distances that are scored for each reference, evenly thinned.
     """
 
-    epipolar_px: float = 2.0
-    pnp: PnpOptions = field(default_factory=PnpOptions)
     min_iterations: int = 1000
     max_iterations: int = 20_000
     pair_iterations: int = 5000
     strongest: int = 2
-    min_matches: int = 8
-    max_distances: int = 200
 
     def __post_init__(self) -> None:
-        check_bounds(self, "epipolar_px", above=0)
         check_bounds(self, "min_iterations", above=0, at_most=self.max_iterations)
-        check_bounds(self, "pair_iterations strongest max_distances", above=0)
-        check_bounds(self, "min_matches", at_least=5)
+        check_bounds(self, "pair_iterations strongest", above=0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,52 +91,39 @@ class Evidence:
         return PixelPoints(self.query.camera, self.x_in_world, self.query.features.pixels(self.keypoint))
 
 
-def disc_chance(camera: Camera, inlier_px: float) -> float:
-    """Chance that a wrong match lies within `inlier_px` of a point's projection: a disc's share of the image."""
-    return float(min(1.0, np.pi * inlier_px**2 / (camera.width_px * camera.height_px)))
-
-
-def band_chance(camera: Camera, epipolar_px: float) -> float:
-    """Chance that a wrong match is within this Sampson distance of its epipolar line: a band's share of the image.
+def band_chance(camera: Camera) -> float:
+    """Chance that a wrong match is within `EPIPOLAR_PX` of its epipolar line: a band's share of the image.
 
     Both keypoints share the distance, so the band is sqrt(2) times as wide; it is at most as long as the diagonal.
     """
     length_px = np.hypot(camera.width_px, camera.height_px)
-    return float(min(1.0, 2 * np.sqrt(2) * epipolar_px * length_px / (camera.width_px * camera.height_px)))
+    return float(min(1.0, 2 * np.sqrt(2) * EPIPOLAR_PX * length_px / (camera.width_px * camera.height_px)))
 
 
 def find_pose(evidence: Evidence, options: RelativePoseOptions) -> RigidTransform | None:
     """Returns the world_from_query with the highest score, not refined; None without a candidate."""
-    candidates = [*_from_points(evidence, options), *_generalized(evidence, options)]
-    for reference in _strongest(evidence.two_view, options):
-        candidates += _by_distance(evidence, reference, options)
-    if not candidates:
-        return None
-    return candidates[int(np.argmax([score(evidence, pose, options) for pose in candidates]))]
+    by_points = ransac(evidence.points, None, PNP) if len(evidence.x_in_world) >= MIN_MATCHES else None
+    found = [by_points, _generalized(evidence, options)]
+    found += [_by_distance(evidence, it, options) for it in _strongest(evidence.two_view, options)]
+    candidates = [pose for pose in found if pose is not None]
+    return max(candidates, key=lambda pose: score(evidence, pose), default=None)
 
 
-def score(evidence: Evidence, world_from_query: RigidTransform, options: RelativePoseOptions) -> float:
+def score(evidence: Evidence, world_from_query: RigidTransform) -> float:
     """The score of a pose; the docstring of this module defines it."""
     rotation, centre = world_from_query.rotation, world_from_query.translation
-    return float(_scores_along(evidence, rotation, centre, np.zeros(3), np.zeros(1), options)[0])
+    return float(_scores_along(evidence, rotation, centre, np.zeros(3), np.zeros(1))[0])
 
 
-def _scores_along(
-    evidence: Evidence,
-    rotation: Array,
-    centre: Array,
-    direction: Array,
-    distance: Array,
-    options: RelativePoseOptions,
-) -> Array:
+def _scores_along(evidence: Evidence, rotation: Array, centre: Array, direction: Array, distance: Array) -> Array:
     """Scores (S,) at centre + distance * direction, for S distances."""
-    camera, inlier_px = evidence.query.camera, options.pnp.inlier_px
-    lines = evidence.two_view.sampson_along_px(rotation, centre, direction, distance) / options.epipolar_px
-    total = -np.log10(band_chance(camera, options.epipolar_px)) * _truncated(lines)
+    camera = evidence.query.camera
+    lines = evidence.two_view.sampson_along_px(rotation, centre, direction, distance) / EPIPOLAR_PX
+    total = -np.log10(band_chance(camera)) * _truncated(lines)
     if len(evidence.x_in_world):
-        weight, points = -np.log10(disc_chance(camera, inlier_px)), evidence.points
+        weight, points = -np.log10(disc_chance(camera, PNP.inlier_px)), evidence.points
         errors = [points.errors_px(RigidTransform(rotation, centre + it * direction)) for it in distance]
-        total = total + weight * _truncated(np.array(errors) / inlier_px)
+        total = total + weight * _truncated(np.array(errors) / PNP.inlier_px)
     return np.asarray(total)
 
 
@@ -136,19 +132,13 @@ def _truncated(residuals: Array) -> Array:
     return np.asarray(np.clip(1 - np.nan_to_num(residuals, nan=np.inf) ** 2, 0, None).sum(axis=1))
 
 
-def _from_points(evidence: Evidence, options: RelativePoseOptions) -> list[RigidTransform]:
-    if len(evidence.x_in_world) < options.pnp.min_matches:
-        return []
-    pose = ransac(evidence.points, None, options.pnp)
-    return [pose] if pose else []
-
-
-def _generalized(evidence: Evidence, options: RelativePoseOptions) -> list[RigidTransform]:
+def _generalized(evidence: Evidence, options: RelativePoseOptions) -> RigidTransform | None:
+    """The generalized relative pose."""
     two_view, references = evidence.two_view, evidence.references
     counts = np.bincount(two_view.reference, minlength=len(references))
     used = np.flatnonzero(counts)
     if len(used) < 2 or counts.max() < 5:  # PoseLib's sampling would not end
-        return []
+        return None
     pairs = []
     for reference in used:
         rows, pair = two_view.reference == reference, poselib.PairwiseMatches()
@@ -161,26 +151,21 @@ def _generalized(evidence: Evidence, options: RelativePoseOptions) -> list[Rigid
         [poselib_camera(it.view.camera) for it in references],
         [poselib_pose(RigidTransform(np.eye(3), np.zeros(3)))],
         [poselib_camera(evidence.query.camera)],
-        {
-            "max_epipolar_error": options.epipolar_px,
-            "min_iterations": options.min_iterations,
-            "max_iterations": options.max_iterations,
-            "seed": 0,
-        },
-        {"loss_type": "CAUCHY", "loss_scale": options.pnp.loss_scale_px},
+        {"max_epipolar_error": EPIPOLAR_PX, **iterations_between(options.min_iterations, options.max_iterations)},
+        REFINEMENT,
     )
-    return _finite(pose)
+    return inverse_of(pose)
 
 
 def _strongest(two_view: TwoViewMatches, options: RelativePoseOptions) -> list[int]:
     """Indices of the references with the most matches."""
     counts = np.bincount(two_view.reference)
     order = np.argsort(-counts, kind="stable")[: options.strongest]
-    return [int(it) for it in order if counts[it] >= options.min_matches]
+    return [int(it) for it in order if counts[it] >= MIN_PAIR_MATCHES]
 
 
-def _by_distance(evidence: Evidence, reference: int, options: RelativePoseOptions) -> list[RigidTransform]:
-    """Poses relative to a reference, each at the distance that the other matches support most."""
+def _by_distance(evidence: Evidence, reference: int, options: RelativePoseOptions) -> RigidTransform | None:
+    """The pose relative to a reference, at the distance that the other matches support most."""
     view, two_view = evidence.references[reference], evidence.two_view
     theirs, ours = _pixels(evidence, two_view.reference == reference, reference)
     relative, _ = poselib.estimate_relative_pose(
@@ -188,27 +173,22 @@ def _by_distance(evidence: Evidence, reference: int, options: RelativePoseOption
         ours,
         poselib_camera(view.view.camera),
         poselib_camera(evidence.query.camera),
-        {
-            "max_epipolar_error": options.epipolar_px,
-            "min_iterations": options.pnp.min_iterations,
-            "max_iterations": options.pair_iterations,
-            "seed": 0,
-        },
-        {"loss_type": "CAUCHY", "loss_scale": options.pnp.loss_scale_px},
+        {"max_epipolar_error": EPIPOLAR_PX, **iterations_between(PNP.min_iterations, options.pair_iterations)},
+        REFINEMENT,
     )
-    turned = _finite(relative)  # reference_from_query, at a distance of one
-    if not turned:
-        return []
-    rotation = view.world_from_camera.rotation @ turned[0].rotation
-    direction = view.world_from_camera.rotation @ turned[0].translation
+    turned = inverse_of(relative)  # reference_from_query, at a distance of one
+    if turned is None:
+        return None
+    rotation = view.world_from_camera.rotation @ turned.rotation
+    direction = view.world_from_camera.rotation @ turned.translation
     centre = view.world_from_camera.translation
     distances = _distances(evidence, reference, rotation, centre, direction)
     distances = distances[np.isfinite(distances) & (distances > 0)]
     if not len(distances):
-        return []
-    distances = np.sort(distances)[:: -(-len(distances) // options.max_distances)]
-    scores = _scores_along(evidence, rotation, centre, direction, distances, options)
-    return [RigidTransform(rotation, centre + float(distances[np.argmax(scores)]) * direction)]
+        return None
+    distances = np.sort(distances)[:: -(-len(distances) // MAX_DISTANCES)]
+    scores = _scores_along(evidence, rotation, centre, direction, distances)
+    return RigidTransform(rotation, centre + float(distances[np.argmax(scores)]) * direction)
 
 
 def _distances(evidence: Evidence, reference: int, rotation: Array, centre: Array, direction: Array) -> Array:
@@ -228,11 +208,3 @@ def _pixels(evidence: Evidence, rows: NDArray[np.bool_], reference: int) -> tupl
     two_view, view = evidence.two_view, evidence.references[reference].view
     ours = evidence.query.features.pixels(two_view.keypoint[rows])
     return view.features.pixels(two_view.reference_keypoint[rows]), ours
-
-
-def _finite(pose: poselib.CameraPose) -> list[RigidTransform]:
-    """Inverts a pose of PoseLib; an empty list if it is not finite."""
-    rotation, translation = np.asarray(pose.R), np.asarray(pose.t)
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        return []
-    return [RigidTransform(rotation, translation).inverse()]

@@ -1,9 +1,8 @@
 """The pose from two-view matches and 2D-3D matches, adjusted over both.
 
 A two-view match becomes a point that its reference and the query observe. Eliminating the point from the adjustment
-(see `bundle`) leaves its epipolar residual, exactly rather than to first order, with the noise of both keypoints and of
-the reference's pose; so both kinds of match are adjusted by one problem (`adjust`), and its covariance covers both: a
-point without its only reference has no information.
+(see `bundle`) leaves its epipolar residual, with the noise of both keypoints and of the reference's pose; so `adjust`
+treats both kinds of match alike, and its covariance covers both.
 """
 
 from collections.abc import Sequence
@@ -25,16 +24,13 @@ from ..structure.match import MatchOptions, match_points, vote
 from ..structure.model import PointMatches, Structure
 from ..structure.structure import StructureOptions, triangulated_structure
 from .relative import Evidence, RelativePoseOptions, find_pose, score
-from .two_view_matches import TwoViewMatches
-
-POSE = RelativePoseOptions()
-"""Of the search for the initial pose, and of its inliers."""
+from .two_view_matches import EPIPOLAR_PX, TwoViewMatches
 
 MIN_PARALLAX_DEG = 0.5
 """Matches with a smaller parallax are not adjusted: their points have no depth."""
 
 ROUNDS = 3
-"""Of choosing inliers and adjusting."""
+"""Rounds of choosing inliers and adjusting."""
 
 MIN_INLIERS = 8
 """Fewer matches do not determine a pose with any redundancy."""
@@ -66,7 +62,7 @@ def solve_two_view(
     matches = vote(structure, [len(it.view.features) for it in references], correspondences)
     two_view = TwoViewMatches.of(query, references, correspondences.query_matches)
     evidence = Evidence(query, references, two_view, structure.x_in_world[matches.point], matches.keypoint)
-    pose = find_pose(evidence, POSE)
+    pose = find_pose(evidence, RelativePoseOptions())
     if pose is None:
         return None
     searched = match_points(query, references, structure, correspondences, pose, options.match)
@@ -136,9 +132,9 @@ class _Problem:
         rest = evidence.two_view[~np.isin(evidence.two_view.keypoint, matches.keypoint[inliers])]
         points, parallax_deg = rest.triangulated(query, evidence.references, pose, self.structure.noise)
         sampson_px = rest.sampson_px(pose)
-        agreeing = (sampson_px < POSE.epipolar_px) & np.isfinite(points).all(axis=1)
+        agreeing = (sampson_px < EPIPOLAR_PX) & np.isfinite(points).all(axis=1)
         support = TwoViewSupport(rest.reference, rest.keypoint, rest.reference_keypoint, points, sampson_px, agreeing)
-        value = score(evidence, pose, POSE)
+        value = score(evidence, pose)
         return _Solution(pose, value, errors_px, inliers, support, parallax_deg, estimate)
 
     def adjusted(self, start: _Solution) -> _Solution | None:

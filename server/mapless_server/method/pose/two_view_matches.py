@@ -11,9 +11,6 @@ grad e is the derivative by both keypoints,
     R^T (b x R_r a) / f    and    R_r^T (R y x b) / f_r    (their components x and y).
 
 All of these are linear in b, hence in c: along a line of camera centres they cost two evaluations.
-
-One match is one equation for the six unknowns of a pose. The equations of one reference leave the distance from it
-open; those of a second one determine it.
 """
 
 from collections.abc import Sequence
@@ -28,6 +25,9 @@ from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, View
 from ..structure.observations import KeypointNoise, triangulate
 from ..structure.structure import observe
+
+EPIPOLAR_PX = 2.0
+"""Largest Sampson distance of a match that agrees with a pose; keypoints are accurate to about a pixel."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,11 @@ ones. So a wrong prior does no harm: it is not used, and the answer equals the o
 
 The refinement has fixed points, and the pose alone as unknowns (PoseLib's has no priors):
 
-    min  sum_i rho(|u_i - pi(P, X_i)|^2 / sigma^2) + w sum_k r_k^T C_k^-1 r_k,    rho(s) = c^2 log(1 + s / c^2)
+    min  sum_i rho(|u_i - pi(P, X_i)|^2) + w sum_k r_k^T C_k^-1 r_k,    rho(s) = c^2 log(1 + s / c^2)
 
-With few inliers, a pose from two matches and gravity needs fewer samples in RANSAC than one from three matches. Gravity
-is known to about a degree, which is many pixels, so such a pose is only a hypothesis: it is scored with a tolerance as
-large as gravity's error in the image, and the best are refined with gravity as one measurement among others.
+With few inliers, RANSAC also draws poses from two matches and gravity, which need fewer samples than three matches.
+Gravity is known to about a degree, which is many pixels, so they are scored with a tolerance as large as gravity's
+error in the image, and the best are refined with gravity as one measurement among others.
 """
 
 import math
@@ -35,11 +35,8 @@ from ..optim.optimize import (
 )
 from ..structure.model import PixelPoints
 
-SIGMA_PX = 1.0
-"""Standard deviation of a right match."""
-
-LOSS_SCALE_SIGMA = 1.4
-"""Scale c of the Cauchy loss, in standard deviations."""
+LOSS_SCALE_PX = 1.4
+"""Scale c of the Cauchy loss; a right match has a standard deviation of one pixel."""
 
 PRIOR_WEIGHT = 4.0
 """w, factor by which the matches have less information than if their errors were independent: the square of
@@ -51,8 +48,7 @@ MIN_INLIERS = 4
 """Fewer give no pose."""
 
 ENOUGH_INLIERS = 50
-"""With so many no candidates from priors are tried, since none could be better. Repeated structure has supported wrong
-poses with at most 23 matches."""
+"""With so many no candidates from priors are tried: more than repeated structure gives a wrong pose."""
 
 MIN_KEPT_SHARE = 0.8
 """A refinement without priors that keeps a smaller share of the inliers has diverged; priors are then compared with the
@@ -66,7 +62,7 @@ MAX_MATCHES = 300
 
 BATCH, MAX_SAMPLES, CONFIDENCE = 64, 512, 0.999
 """Samples that are scored together, and at most; and the probability that two right matches have been drawn with which
-it stops. If 10 % of the matches are right, that is 99.4 % after all samples."""
+it stops."""
 
 REFINED = 3
 """Number of the best hypotheses that are refined."""
@@ -101,85 +97,68 @@ def informed_pose(
     def cost(pose: RigidTransform) -> float:
         """Truncated sum of squared errors, in standard deviations of a keypoint, plus `Priors.penalty`."""
         errors_px = seen.errors_px(pose)
-        squared = (np.where(errors_px < inlier_px, errors_px, inlier_px) / SIGMA_PX) ** 2
+        squared = np.where(errors_px < inlier_px, errors_px, inlier_px) ** 2
         return float(squared.sum()) + priors.penalty(pose)
 
-    best, others = found, []
-    if found is None or _inlier_count(seen, found, inlier_px) < ENOUGH_INLIERS:
-        others = _from_priors(seen, priors, inlier_px)
+    best, others = found, list[RigidTransform]()
+    if found is None or seen.inlier_count(found, inlier_px) < ENOUGH_INLIERS:
+        if priors.pose:
+            others.append(refine_pose(seen, priors.pose.world_from_camera, priors))
+        if priors.gravity:
+            others += ransac_with_gravity(seen, priors.gravity, priors, inlier_px)
     if others:
         costs = [cost(pose) for pose in others]
         # Better by one match at least; otherwise it is the same pose found in another way.
         least = math.inf if found is None else cost(found)
-        if min(costs) < least - (inlier_px / SIGMA_PX) ** 2:
+        if min(costs) < least - inlier_px**2:
             best = others[int(np.argmin(costs))]
     return None if best is None else _with_priors(seen, best, priors, inlier_px)
-
-
-def _from_priors(seen: PixelPoints, priors: Priors, inlier_px: float) -> list[RigidTransform]:
-    """Candidates from priors: the pose prior, and poses by RANSAC with gravity."""
-    poses = []
-    if priors.pose:
-        poses.append(refine_pose(seen, priors.pose.world_from_camera, priors))
-    if priors.gravity:
-        poses += ransac_with_gravity(seen, priors, inlier_px)
-    return poses
 
 
 def _with_priors(seen: PixelPoints, pose: RigidTransform, priors: Priors, inlier_px: float) -> InformedPose:
     """Checks the priors and refines a pose, which has `MIN_INLIERS` inliers or more, with the consistent ones."""
     alone = refine_pose(seen, pose, NO_PRIORS)
-    before, after = (_inlier_count(seen, it, inlier_px) for it in (pose, alone))
+    before, after = (seen.inlier_count(it, inlier_px) for it in (pose, alone))
     if after < max(MIN_INLIERS, MIN_KEPT_SHARE * before):
         alone = pose
     # The inverse covariance of the pose error if the matches' errors were independent.
-    information = _Problem(seen, alone, NO_PRIORS).linearize(alone)[1]
+    information = _Problem(seen, alone, NO_PRIORS, LOSS_SCALE_PX).linearize(alone)[1]
     covariance = np.linalg.inv(information / PRIOR_WEIGHT + WEAK_INFORMATION)
     checks = priors.check(alone, np.asarray(covariance, np.float64))
     used = priors.consistent(checks)
     return InformedPose(refine_pose(seen, pose, used) if used else pose, pose, checks, used)
 
 
-def _inlier_count(seen: PixelPoints, pose: RigidTransform, inlier_px: float) -> int:
-    return int((seen.errors_px(pose) < inlier_px).sum())
-
-
 def refine_pose(
-    seen: PixelPoints,
-    world_from_camera: RigidTransform,
-    priors: Priors,
-    loss_scale_sigma: float = LOSS_SCALE_SIGMA,
-    steps: MinimizeOptions = STEPS,
+    seen: PixelPoints, world_from_camera: RigidTransform, priors: Priors, loss_scale_px: float = LOSS_SCALE_PX
 ) -> RigidTransform:
     """Minimizes the cost, starting from a pose; all priors are used, and no points behind the camera at the start."""
-    return minimize(_Problem(seen, world_from_camera, priors, loss_scale_sigma), world_from_camera, steps)
+    return minimize(_Problem(seen, world_from_camera, priors, loss_scale_px), world_from_camera, STEPS)
 
 
 class _Problem:
     """The cost and its derivatives by the pose error; see `optimize.Problem`."""
 
-    def __init__(
-        self, seen: PixelPoints, start: RigidTransform, priors: Priors, loss_scale_sigma: float = LOSS_SCALE_SIGMA
-    ) -> None:
+    def __init__(self, seen: PixelPoints, start: RigidTransform, priors: Priors, loss_scale_px: float) -> None:
         self.seen = seen[start.inverse().apply(seen.x_in_world)[:, 2] > 0]
-        self.priors, self.loss_scale_sigma = priors, loss_scale_sigma
+        self.priors, self.loss_scale_px = priors, loss_scale_px
 
     def residuals(self, pose: RigidTransform) -> tuple[Array, Array]:
-        """Points in the camera frame (N, 3), and reprojection errors (N, 2) in standard deviations."""
+        """Points in the camera frame (N, 3), and reprojection errors (N, 2), pixels."""
         x_in_camera = (self.seen.x_in_world - pose.translation) @ pose.rotation
-        return x_in_camera, (self.seen.camera.project(x_in_camera) - self.seen.pixels) / SIGMA_PX
+        return x_in_camera, self.seen.camera.project(x_in_camera) - self.seen.pixels
 
     def cost(self, pose: RigidTransform) -> float:
         """Cost at a pose; NaN if a point is behind the camera, so that the step is rejected."""
         _, residual = self.residuals(pose)
-        matched = cauchy_cost((residual**2).sum(axis=1), self.loss_scale_sigma)
+        matched = cauchy_cost((residual**2).sum(axis=1), self.loss_scale_px)
         return matched + PRIOR_WEIGHT * self.priors.cost(pose)
 
     def linearize(self, pose: RigidTransform) -> tuple[Array, Array]:
         """Half the cost's gradient (6,) and its information (6, 6), in ROS's order."""
         x_in_camera, residual = self.residuals(pose)
-        weight = cauchy_weight((residual**2).sum(axis=1), self.loss_scale_sigma)
-        jacobian = pose_jacobian(self.seen.camera, x_in_camera) / SIGMA_PX
+        weight = cauchy_weight((residual**2).sum(axis=1), self.loss_scale_px)
+        jacobian = pose_jacobian(self.seen.camera, x_in_camera)
         weighted, to_camera = weight * jacobian, np.linalg.inv(world_jacobian(pose))
         by_pose = weighted[0] @ residual[:, 0] + weighted[1] @ residual[:, 1]
         hessian = weighted[0] @ jacobian[0].T + weighted[1] @ jacobian[1].T
@@ -196,14 +175,13 @@ class _Problem:
         return None if error is None else moved(pose, error)
 
 
-def ransac_with_gravity(seen: PixelPoints, priors: Priors, inlier_px: float) -> list[RigidTransform]:
+def ransac_with_gravity(
+    seen: PixelPoints, gravity: GravityPrior, priors: Priors, inlier_px: float
+) -> list[RigidTransform]:
     """Finds the best hypotheses and refines them with all priors; none if no two matches give a pose.
 
     `inlier_px` is the largest reprojection error of a right match.
     """
-    gravity = priors.gravity
-    if gravity is None:
-        raise ValueError("there is no gravity prior")
     if len(seen) < 2:
         return []
     seen = seen[:: -(-len(seen) // MAX_MATCHES)]
@@ -219,10 +197,9 @@ def ransac_with_gravity(seen: PixelPoints, priors: Priors, inlier_px: float) -> 
         drawn += BATCH
         wanted = _samples_needed(hypotheses.inlier_share)
     # Refined first with a loss as wide as gravity's error, then with a narrow one.
-    scales = max(wide_px / 2 / SIGMA_PX, LOSS_SCALE_SIGMA), LOSS_SCALE_SIGMA
     poses = hypotheses.best()
-    for scale in scales:
-        poses = [refine_pose(seen, pose, priors, scale) for pose in poses]
+    for scale_px in (max(wide_px / 2, LOSS_SCALE_PX), LOSS_SCALE_PX):
+        poses = [refine_pose(seen, pose, priors, scale_px) for pose in poses]
     return poses
 
 

@@ -63,21 +63,12 @@ def match_points(
     known = PointMatches(nothing, nothing, np.empty(0, bool), options.radius_px)
     if options.through_tracks:
         known = vote(structure, [len(r.view.features) for r in references], correspondences)
-    if prior_pose is not None and _inlier_count(query, structure, known, prior_pose, options) > _inlier_count(
-        query, structure, known, world_from_query, options
-    ):
-        world_from_query = prior_pose
+    if prior_pose is not None:
+        seen = known.seen(query, structure.x_in_world)
+        poses = (world_from_query, prior_pose)
+        world_from_query = max(poses, key=lambda pose: seen.inlier_count(pose, options.radius_px))
     found = search(query, references, structure, world_from_query, known, options)
     return replace(known.and_last(found.point, found.keypoint, found.guided), radius_px=options.radius_px)
-
-
-def _inlier_count(
-    query: View, structure: Structure, known: PointMatches, world_from_query: RigidTransform, options: MatchOptions
-) -> int:
-    """Counts the matches within the radius of a guided search from this pose."""
-    x_in_camera = world_from_query.inverse().apply(structure.x_in_world[known.point])
-    away = query.camera.project(x_in_camera) - query.features.keypoints[known.keypoint]
-    return int((np.linalg.norm(away, axis=1) < options.radius_px).sum())
 
 
 def vote(structure: Structure, keypoint_counts: Sequence[int], correspondences: Correspondences) -> PointMatches:

@@ -180,6 +180,10 @@ class PixelPoints:
         projected = self.camera.project(world_from_camera.inverse().apply(self.x_in_world))
         return np.asarray(np.linalg.norm(projected - self.pixels, axis=1))
 
+    def inlier_count(self, world_from_camera: RigidTransform, inlier_px: float) -> int:
+        """Number of points with a smaller error at a pose."""
+        return int((self.errors_px(world_from_camera) < inlier_px).sum())
+
 
 @dataclass(frozen=True, eq=False)
 class PointMatches:

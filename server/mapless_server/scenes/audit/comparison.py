@@ -16,7 +16,7 @@ from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge.judge import JudgeOptions, judge
 from mapless_server.method.optim.optimize import world_covariance
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pose.pnp import PnpOptions, false_alarms, ransac
+from mapless_server.method.pose.pnp import MIN_MATCHES, PnpOptions, false_alarms, ransac
 from mapless_server.method.structure.model import PixelPoints, PointMatches
 
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points, observed_points
@@ -212,7 +212,7 @@ def compare(subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatc
     matches, neighbour_matches = match_points(subject, neighbourhood, pairs)
     points = observed_points(subject, neighbourhood, matches)
     fits: dict[Free, CameraFit] = {}
-    if len(points) >= _RANSAC.min_matches:
+    if len(points) >= MIN_MATCHES:
         camera, given = subject.view.camera, subject.world_from_camera
         found = ransac(PixelPoints(camera, points.x_in_world, points.pixel), None, _RANSAC)
         starts = (given,) if found is None else (given, found)
