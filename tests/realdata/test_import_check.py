@@ -15,7 +15,8 @@ from support.bags import BASE_FROM_CAMERA, at, image, info, odometry, transforms
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.views import Ignored, View
-from mapless_server.method.pairs.readings import Verdict, implausible_depth
+from mapless_server.method.pairs.readings.depth import implausible_depth
+from mapless_server.method.pairs.readings.verdict import Verdict
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.ingest.check import check_frames
 from mapless_tools.ingest.formats import KeyframeOptions, ReadOptions, read_dataset

@@ -6,7 +6,7 @@ import numpy as np
 from support.scenes import CAMERA
 
 from mapless.geometry import RigidTransform
-from mapless_server.method.pairs.readings import is_start
+from mapless_server.method.pairs.readings.repeats import is_start
 from mapless_server.scenes.repeats import PosedImage, repeats
 from mapless_server.security import SceneKey
 from mapless_server.store import ReferenceRecord

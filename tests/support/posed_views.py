@@ -7,7 +7,7 @@ import numpy as np
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.features.views import PosedView
-from mapless_server.method.pairs.readings import MatchedPair, consistent_matches
+from mapless_server.method.pairs.readings.errors import MatchedPair, consistent, distinct_matches
 
 from .scenes import SceneOptions, look_at, observe, random_for, unit_rows
 
@@ -35,7 +35,8 @@ def matched(count: int = 8) -> list[MatchedPair]:
     """Of the planted views: matches do not depend on poses."""
     views, found = planted(count), []
     for i, j in combinations(range(len(views)), 2):
-        matches = consistent_matches(views[i].view, views[j].view)
+        first, second = views[i].view, views[j].view
+        matches = consistent(first, second, distinct_matches(first, second))
         if j - i <= 3 and len(matches):
             found.append(MatchedPair((i, j), matches))
     return found

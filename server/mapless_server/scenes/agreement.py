@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapless_server.method.pairs.agreement import MAX_ERROR_PX
-from mapless_server.method.pairs.readings import implausible_depth, sessions_of
+from mapless_server.method.pairs.readings.depth import implausible_depth
+from mapless_server.method.pairs.readings.sessions import sessions_of
 from mapless_server.store.pairs import Pair
 
 

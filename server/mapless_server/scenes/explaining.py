@@ -18,14 +18,11 @@ from mapless_server.method.options import StageContext
 from mapless_server.method.pairs.agreement import MAX_ERROR_PX
 from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.epipolar import SAME_PLACE
-from mapless_server.method.pairs.readings import (
-    MatchedPair,
-    align_sessions,
-    consistent,
-    explain,
-    median_depth,
-    same_poses,
-)
+from mapless_server.method.pairs.readings.alignment import align_sessions
+from mapless_server.method.pairs.readings.depth import median_depth
+from mapless_server.method.pairs.readings.errors import MatchedPair, consistent
+from mapless_server.method.pairs.readings.explanation import explain
+from mapless_server.method.pairs.readings.repeats import same_poses
 from mapless_server.method.pairs.stationary import stationary_matches
 from mapless_server.security import SceneKey
 from mapless_server.store.pairs import Pair

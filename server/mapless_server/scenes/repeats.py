@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mapless.geometry import RigidTransform
-from mapless_server.method.pairs.readings import is_start, pose_difference, same_poses
+from mapless_server.method.pairs.readings.repeats import is_start, pose_difference, same_poses
 from mapless_server.store import ReferenceRecord
 from mapless_server.store.reader import ALIKE_MOST
 

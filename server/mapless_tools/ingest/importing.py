@@ -12,7 +12,8 @@ from mapless import Client, MaplessError, Reference
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, image_size
-from mapless_server.method.pairs.readings import Verdict, implausible_depth
+from mapless_server.method.pairs.readings.depth import implausible_depth
+from mapless_server.method.pairs.readings.verdict import Verdict
 from mapless_server.scenes.plausibility import another_unit, contradictions
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import Settings

@@ -6,7 +6,9 @@ from typing import Any
 
 from rich.console import Console
 
-from mapless_server.method.pairs.readings import Alignment, Verdict, is_start, similarity_text
+from mapless_server.method.pairs.readings.alignment import Alignment
+from mapless_server.method.pairs.readings.repeats import is_start
+from mapless_server.method.pairs.readings.verdict import Verdict
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.output_files import finite
 
@@ -186,7 +188,7 @@ def _scene_verdict_json(verdict: SceneVerdict) -> dict[str, Any]:
             "scale": found.world_from_other.scale,
             "rotation": found.world_from_other.rotation.tolist(),
             "translation": found.world_from_other.translation.tolist(),
-            "text": similarity_text(found.world_from_other),
+            "text": found.text,
             "median_px": finite(found.median_px),
         },
     }

@@ -12,16 +12,10 @@ from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 from mapless.geometry import Quaternion, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.features.views import Features, PosedView, View
 from mapless_server.method.pairs.epipolar import sampson_px
-from mapless_server.method.pairs.readings import (
-    MatchedPair,
-    Verdict,
-    align,
-    consistent_matches,
-    errors_of,
-    judge,
-    suspects_of,
-)
+from mapless_server.method.pairs.readings.alignment import align
+from mapless_server.method.pairs.readings.errors import MatchedPair, consistent, distinct_matches, errors_of
 from mapless_server.method.pairs.readings.rounding import steps_of
+from mapless_server.method.pairs.readings.verdict import Verdict, judge, suspects_of
 
 BODY = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Optical axes from those of REP 103."""
@@ -284,7 +278,7 @@ def test_a_moved_keypoints_error_is_its_displacement() -> None:
     """Sampson's distance is to first order how far both keypoints must move: one alone, moved, at most as far."""
     options = SceneOptions(noise_px=0.0, reference_count=2, distractor_count=0, seen_share=1.0)
     first, second = make_scene(random_for("sampson"), options).references
-    matches = consistent_matches(first.view, second.view)
+    matches = consistent(first.view, second.view, distinct_matches(first.view, second.view))
     assert len(matches) > 300
     assert sampson_px(first, second, matches).max() < 1e-3
     features = second.view.features
@@ -295,7 +289,7 @@ def test_a_moved_keypoints_error_is_its_displacement() -> None:
 
 def test_photographs_at_one_place_are_compared_by_rotation() -> None:
     first, second = make_scene(random_for("one place"), SceneOptions(reference_count=2)).references
-    matches = consistent_matches(first.view, second.view)
+    matches = consistent(first.view, second.view, distinct_matches(first.view, second.view))
     one_place = replace(second, world_from_camera=first.world_from_camera)
     assert np.median(sampson_px(first, one_place, matches)) > 10
     turned_pose = RigidTransform(first.world_from_camera.rotation @ rotation_from_vector([0.0, 0.2, 0.1]), np.zeros(3))

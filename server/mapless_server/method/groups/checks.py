@@ -17,7 +17,8 @@ from ..bundle.priors import conflict_threshold
 from ..features.views import PosedView
 from ..judge.answer import Answer, Localization
 from ..judge.hints import FEW_MATCHES, MANY_MATCHES
-from ..pairs.readings import CONVENTIONS, MOST_NAMED, Convention
+from ..pairs.readings.conventions import CONVENTIONS, Convention
+from ..pairs.readings.explanation import MOST_NAMED
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .jumps import ALL_JUMPS, find_jumps
 from .rig import RigEstimate
@@ -83,7 +84,7 @@ def check_tracking(
         f"{tracked:.2f} long, that of the photographs {shown_m:.2f} {unit}"
     )
     if readings:
-        texts = [it.text_in("session") for it in readings]
+        texts = [it.text.replace("world", "session") for it in readings]
         likely = "; or ".join(texts) if len(texts) <= MOST_NAMED else "they are in other axes"
         message += f"; likely: {likely}: read so, they agree with all photographs"
     return Rejection(RejectionReason.GATE, message, CHECK_TRACKING)

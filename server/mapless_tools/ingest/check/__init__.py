@@ -7,7 +7,7 @@ not fit, photographs that are near in the folder's order are compared as well.
 from collections.abc import Sequence
 
 from mapless_server.method.features.extractors import FeatureExtractor, SiftExtractor
-from mapless_server.method.pairs.readings import Verdict, judge
+from mapless_server.method.pairs.readings.verdict import Verdict, judge
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 

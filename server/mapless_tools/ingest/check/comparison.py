@@ -8,7 +8,8 @@ from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import Matches, PosedView
-from mapless_server.method.pairs.readings import MatchedPair, Pair, Verdict, consistent, distinct_matches, judge
+from mapless_server.method.pairs.readings.errors import MatchedPair, Pair, consistent, distinct_matches
+from mapless_server.method.pairs.readings.verdict import Verdict, judge
 from mapless_server.method.pairs.stationary import fixed_in, without_ignored
 from mapless_server.settings import available_cores
 from mapless_tools.dataset import Frame

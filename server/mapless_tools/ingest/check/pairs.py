@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
-from mapless_server.method.pairs.readings import Pair, same_poses
+from mapless_server.method.pairs.readings.errors import Pair
+from mapless_server.method.pairs.readings.repeats import same_poses
 
 PAIR_COUNT = 24
 """Enough that a median over them is settled; their features take seconds."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from mapless import Client, DataLoss, InvalidArgument, NotFound, Reference
 from mapless_server.method.features.extractors import FeatureExtractor, SiftExtractor
-from mapless_server.method.pairs.readings import Alignment, Pair, PairError, align, errors_of
+from mapless_server.method.pairs.readings.alignment import Alignment, align
+from mapless_server.method.pairs.readings.errors import Pair, PairError, errors_of
 from mapless_tools.dataset import Frame
 from mapless_tools.progress import Progress
 

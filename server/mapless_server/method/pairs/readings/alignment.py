@@ -81,17 +81,12 @@ class Alignment:
     @property
     def text(self) -> str:
         """The similarity in words: scale, rotation and translation, applied in this order."""
-        return similarity_text(self.world_from_other)
-
-
-def similarity_text(it: Similarity) -> str:
-    """A similarity in words: scale, rotation and translation, applied in this order."""
-    angle_deg = rotation_angle_deg(it.rotation)
-    axis = rotation_vector(it.rotation)
-    axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
-    about = f" about ({', '.join(f'{number:.3f}' for number in axis + 0.0)})" if angle_deg >= 0.05 else ""
-    shift = ", ".join(f"{number:.3f}" for number in it.translation + 0.0)
-    return f"scale {it.scale:.4g}, rotation by {angle_deg:.1f} degrees{about}, translation ({shift})"
+        it = self.world_from_other
+        angle_deg, axis = rotation_angle_deg(it.rotation), rotation_vector(it.rotation)
+        axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
+        about = f" about ({', '.join(f'{number:.3f}' for number in axis + 0.0)})" if angle_deg >= 0.05 else ""
+        shift = ", ".join(f"{number:.3f}" for number in it.translation + 0.0)
+        return f"scale {it.scale:.4g}, rotation by {angle_deg:.1f} degrees{about}, translation ({shift})"
 
 
 def align(views: Views, matched: Sequence[MatchedPair]) -> Alignment | None:
@@ -126,7 +121,10 @@ def align_sessions(
 
 @dataclass(frozen=True, eq=False)
 class _Worlds:
-    """Pairs between two worlds: middles and extents of both, about which a similarity has few correlations."""
+    """Pairs between two worlds, and the sum of the losses of all distances, over similarities; see `optimize.Problem`.
+
+    Similarities are changed about the middles of both worlds, and by their extent: so they have few correlations.
+    """
 
     sample: PairSample
     middle: Array
@@ -162,45 +160,35 @@ class _Worlds:
 
     def refined(self, start: Similarity) -> Alignment:
         """Minimizes the distances of all matches."""
-        problem = _Refinement(self)
-        found = minimize(problem, start, STEPS)
+        found = minimize(self, start, STEPS)
         median_px, bad_share = self.measured(found)
-        information = problem.linearize(found)[0] / max(_INFLATION * median_px, 1e-3) ** 2
+        information = self.linearize(found)[0] / max(_INFLATION * median_px, 1e-3) ** 2
         sigmas = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information + 1e-12 * np.eye(7))), 0.0))
         rotation_deg, position = math.degrees(float(sigmas[1:4].max())), float(sigmas[4:].max())
         return Alignment(found, median_px, bad_share, len(self.sample.pairs), float(sigmas[0]), rotation_deg, position)
 
-
-@dataclass(frozen=True, eq=False)
-class _Refinement:
-    """The sum of the losses of all distances, over similarities."""
-
-    worlds: _Worlds
-
     def distances_px(self, x: Similarity) -> Array:
-        found = self.worlds.sample.distances_px(self.worlds.sample.views, self.worlds.moved(x))
+        """Signed distances of all matches, pixels; 0 where there is none."""
+        found = self.sample.distances_px(self.sample.views, self.moved(x))
         return np.asarray(np.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0))
 
     def cost(self, x: Similarity) -> float:
+        """See Problem."""
         return float(soft_l1(self.distances_px(x) ** 2, LOSS_PX).sum())
 
     def linearize(self, x: Similarity) -> tuple[Array, Array]:
         """Normal equations (7, 7), (7,); derivatives by differences."""
         steps = _DIFFERENCE * np.eye(7)
-        derivatives = np.stack(
-            [
-                self.distances_px(self.worlds.changed(x, step)) - self.distances_px(self.worlds.changed(x, -step))
-                for step in steps
-            ],
-            axis=1,
-        ) / (2 * _DIFFERENCE)
+        changes = [self.distances_px(self.changed(x, it)) - self.distances_px(self.changed(x, -it)) for it in steps]
+        derivatives = np.stack(changes, axis=1) / (2 * _DIFFERENCE)
         distances = self.distances_px(x)
         weighted = derivatives * soft_l1_weight(distances**2, LOSS_PX)[:, None]
         return weighted.T @ derivatives, weighted.T @ distances
 
     def step(self, x: Similarity, equations: tuple[Array, Array], damping: float) -> Similarity | None:
+        """See Problem."""
         change = damped_step(*equations, damping)
-        return None if change is None else self.worlds.changed(x, change)
+        return None if change is None else self.changed(x, change)
 
 
 def _relative_poses(views: Views, matched: Sequence[MatchedPair]) -> list[tuple[Array, Array, Array, Array]]:

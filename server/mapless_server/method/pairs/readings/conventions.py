@@ -5,46 +5,41 @@ and camera are mirrored, a rotation is still a rotation, so poses of left-handed
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from itertools import permutations, product
+from dataclasses import dataclass
+from functools import reduce
+from itertools import islice, permutations, product
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from mapless.geometry import Array, Quaternion, RigidTransform
 
-from ...features.views import PosedView
+T = TypeVar("T")
 
 PoseCorrection = Callable[[RigidTransform], RigidTransform]
-ViewCorrection = Callable[[PosedView], PosedView]
 
 USUAL, RARE, STRANGE = 0, 1, 2
 """How common a mistake is: of those that explain a scene equally well, only the most common are named."""
 
 
 @dataclass(frozen=True, eq=False)
-class Convention:
-    """A way in which poses may be meant: how it is named, its correction, and how common it is."""
+class Mistake(Generic[T]):
+    """A way in which data (poses or views) may have been misread: its name, its correction, and how common it is."""
 
     text: str
-    correct: PoseCorrection
+    correct: Callable[[T], T]
     rarity: int
 
-    def text_in(self, frame: str) -> str:
-        """How it is named where the poses are not in the world, but in another frame, such as a session."""
-        return self.text.replace("world", frame)
 
+Convention = Mistake[RigidTransform]
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 """From a left-handed world to a right-handed one; which axis is mirrored changes no relative pose."""
 
 
-def turned_camera(rotation: Array) -> PoseCorrection:
-    """The correction that turns the camera's axes by a rotation (3, 3), in them."""
-    return lambda pose: RigidTransform(pose.rotation @ rotation, pose.translation)
-
-
-def _mirrored(axes: Array) -> PoseCorrection:
-    return lambda pose: RigidTransform(MIRROR @ pose.rotation @ axes, MIRROR @ pose.translation)
+def _with_axes(world: Array, camera: Array) -> PoseCorrection:
+    """The correction that changes the axes of the world and those of the camera by matrices (3, 3)."""
+    return lambda pose: RigidTransform(world @ pose.rotation @ camera, world @ pose.translation)
 
 
 def _reordered(order: tuple[int, int, int, int]) -> PoseCorrection:
@@ -58,18 +53,17 @@ def _reordered(order: tuple[int, int, int, int]) -> PoseCorrection:
     return correct
 
 
-def _of_inverse(correction: PoseCorrection) -> PoseCorrection:
-    """Applies a correction of world_from_camera to poses that are its inverse."""
-    return lambda pose: correction(pose.inverse())
+def _with_positions(axes: Array) -> PoseCorrection:
+    """The correction for positions whose axes (3, 3) are not those of the rotations."""
+    return lambda pose: RigidTransform(pose.rotation, axes @ pose.translation)
 
 
-def _within_inverse(correction: PoseCorrection) -> PoseCorrection:
-    """Applies a correction of camera_from_world to the inverse of poses."""
-    return lambda pose: correction(pose.inverse()).inverse()
+def _in_turn(*corrections: PoseCorrection) -> PoseCorrection:
+    """The correction that applies these one after the other."""
+    return lambda pose: reduce(lambda it, correct: correct(it), corrections, pose)
 
 
-OPTICAL = "an optical frame (x right, y down, z forward)"
-NEEDED = f"where {OPTICAL} is needed"
+NEEDED = "where an optical frame (x right, y down, z forward) is needed"
 _DIRECTIONS = (("right", "left"), ("down", "up"), ("forward", "back"))
 _KNOWN = {
     "x right, y up, z back": (
@@ -98,6 +92,7 @@ _KNOWN = {
 
 
 def _signed_permutations() -> Iterator[Array]:
+    """The 48 matrices (3, 3), the identity first."""
     for order in permutations(range(3)):
         for signs in product((1.0, -1.0), repeat=3):
             matrix = np.zeros((3, 3))
@@ -112,26 +107,20 @@ def _directions(axes: Array) -> str:
 
 
 def _camera_axes() -> Iterator[Convention]:
-    for axes in _signed_permutations():
-        if np.array_equal(axes, np.eye(3)):
-            continue
+    for axes in islice(_signed_permutations(), 1, None):
         is_left_handed = np.linalg.det(axes) < 0
         words = _directions(axes)
         hand = "left-handed: " if is_left_handed else ""
         text, rarity = _KNOWN.get(words, (f"the camera axes are {hand}{words} {NEEDED}", STRANGE))
-        yield Convention(text, _mirrored(axes.T) if is_left_handed else turned_camera(axes.T), rarity)
+        yield Convention(text, _with_axes(MIRROR if is_left_handed else np.eye(3), axes.T), rarity)
 
 
 def _positions_axes() -> Iterator[Convention]:
     """Positions whose world axes are not those of the rotations."""
-    for axes in _signed_permutations():
-        if not np.array_equal(axes, np.eye(3)):
-            names = ", ".join(f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in axes)
-            yield Convention(
-                f"the positions are in other world axes than the rotations: ({names}) of the given x, y, z fits",
-                lambda pose, axes=axes: RigidTransform(pose.rotation, axes @ pose.translation),  # type: ignore[misc]
-                STRANGE,
-            )
+    for axes in islice(_signed_permutations(), 1, None):
+        names = ", ".join(f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in axes)
+        text = f"the positions are in other world axes than the rotations: ({names}) of the given x, y, z fits"
+        yield Convention(text, _with_positions(axes), STRANGE)
 
 
 def _inverses() -> Iterator[Convention]:
@@ -141,11 +130,8 @@ def _inverses() -> Iterator[Convention]:
             text = axes.text.removeprefix("the camera axes are ")
             name = "OpenGL's camera axes" if text.startswith("OpenGL's") else text
             rarity = RARE if axes.rarity == USUAL else STRANGE
-            yield Convention(f"the poses are camera_from_world with {name}", _of_inverse(axes.correct), rarity)
-
-
-_W_FIRST = _reordered((1, 2, 3, 0))
-_W_LAST = _reordered((3, 0, 1, 2))
+            correct = _in_turn(RigidTransform.inverse, axes.correct)
+            yield Convention(f"the poses are camera_from_world with {name}", correct, rarity)
 
 
 def _halves() -> Iterator[Convention]:
@@ -161,17 +147,13 @@ def _halves() -> Iterator[Convention]:
         lambda pose: RigidTransform(pose.rotation, -(pose.rotation @ pose.translation)),
         USUAL,
     )
-    named = (("w x y z and were read as x y z w", _W_FIRST), ("x y z w and were read as w x y z", _W_LAST))
-    for words, correction in named:
-        yield Convention(f"the quaternions are {words}", correction, USUAL)
-        text = f"the quaternions of camera_from_world are {words}"
-        yield Convention(text, _within_inverse(correction), RARE)
+    orders = {"w x y z and were read as x y z w": (1, 2, 3, 0), "x y z w and were read as w x y z": (3, 0, 1, 2)}
+    for words, order in orders.items():
+        correct = _reordered(order)
+        yield Convention(f"the quaternions are {words}", correct, USUAL)
+        of_inverse = _in_turn(RigidTransform.inverse, correct, RigidTransform.inverse)
+        yield Convention(f"the quaternions of camera_from_world are {words}", of_inverse, RARE)
 
 
 CONVENTIONS: tuple[Convention, ...] = (*_camera_axes(), *_inverses(), *_halves(), *_positions_axes())
 """All, the most common not first."""
-
-
-def on_view(correct: PoseCorrection) -> ViewCorrection:
-    """A correction of a view's pose."""
-    return lambda view: replace(view, world_from_camera=correct(view.world_from_camera))

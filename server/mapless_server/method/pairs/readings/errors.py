@@ -30,11 +30,6 @@ def distinct_matches(first: View, second: View) -> Matches:
     return mutual_matches(first.features, second.features, RATIO)
 
 
-def consistent_matches(first: View, second: View) -> Matches:
-    """Inlier matches of one fundamental matrix, without use of poses; none if there are too few."""
-    return consistent(first, second, distinct_matches(first, second))
-
-
 def consistent(first: View, second: View, matches: Matches) -> Matches:
     """Those of the matches (M, 2) that satisfy one fundamental matrix, estimated from them; none if they are few."""
     return matches[fundamental_inliers(first, second, matches)]
@@ -83,7 +78,6 @@ class PairSample:
         """Takes every n-th match of a pair, so that `most` or fewer remain; all by default."""
         self.pairs = [item.pair for item in matched]
         kept = [item.matches[:: 1 if most is None else 1 + len(item.matches) // most] for item in matched]
-        self.counts = [len(it) for it in kept]
         used = {i: [np.zeros(0, np.intp)] for i in sorted({i for pair in self.pairs for i in pair})}
         for pair, matches in zip(self.pairs, kept, strict=True):
             for side, i in enumerate(pair):
@@ -93,9 +87,10 @@ class PairSample:
         self._position = {i: position for position, i in enumerate(self.views)}
         starts = np.concatenate([[0], np.cumsum([len(it) for it in rows.values()])])
         self._ends = np.array([[self._position[i] for i in pair] for pair in self.pairs], np.intp).reshape(-1, 2)
-        width = max(self.counts, default=0)
+        counts = np.array([len(it) for it in kept], np.intp)
+        width = counts.max(initial=0)
         self._rows = np.zeros((2, len(self.pairs), width), np.intp)
-        self._is_match = np.arange(width) < np.array(self.counts, np.intp)[:, None]
+        self._is_match = np.arange(width) < counts[:, None]
         for row, (pair, matches) in enumerate(zip(self.pairs, kept, strict=True)):
             for side, i in enumerate(pair):
                 found = starts[self._position[i]] + np.searchsorted(rows[i], matches[:, side])
@@ -110,12 +105,8 @@ class PairSample:
             return []
         posed, thresholds_px = self._posed(views, seconds)
         errors_px, behind = _medians(np.abs(posed.distances_px())), posed.behind_shares()
-        return [
-            PairError(pair, float(error), float(threshold), count, float(share))
-            for pair, error, threshold, count, share in zip(
-                self.pairs, errors_px, thresholds_px, self.counts, behind, strict=True
-            )
-        ]
+        figures = [it.tolist() for it in (errors_px, thresholds_px, self._is_match.sum(axis=1), behind)]
+        return [PairError(*it) for it in zip(self.pairs, *figures, strict=True)]
 
     def distances_px(self, views: Views, seconds: Views) -> Array:
         """Signed distances (N,) of all matches of all pairs."""

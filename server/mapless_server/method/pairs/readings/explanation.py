@@ -6,14 +6,14 @@ equally well, the more common ones are named; of two, both; of more, none, since
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...features.views import PosedView
 from .alignment import align_sessions
-from .conventions import CONVENTIONS, RARE, STRANGE, USUAL, ViewCorrection, on_view
+from .conventions import CONVENTIONS, RARE, STRANGE, USUAL, Convention, Mistake
 from .errors import MatchedPair, PairError, PairSample, Views, summary
 from .intrinsics import FIELDS_DEG, camera_mistakes, focal_scaled, is_unset, of_field, scaled, with_camera
 from .rounding import rounding_text
@@ -34,7 +34,7 @@ EQUAL_SHARE, EQUAL_PX = 1.25, 0.1
 COVERED_SHARE = 0.8
 """Share of the photographs that two sessions must explain."""
 MOST_NAMED = 2
-"""Explanations that are named beside one another."""
+"""Explanations that are named together, of those that fit equally well."""
 _REFINEMENTS = 3
 _ENOUGH_MATCHES = 64  # for a median that distinguishes mistakes
 _BEHIND_PX = 1000.0  # stands for the error of a pair whose points lie behind its cameras
@@ -66,10 +66,9 @@ def explain(views: Views, matched: Sequence[MatchedPair], given_px: float | None
     if not sample.pairs:
         return Explanation()
     given = _score(sample.measure())[0]
-    corrections = list(_corrections(sample.views))
-    candidates = [
-        _Candidate(text, *_score_with(sample, correct), rarity) for text, correct, rarity in corrections
-    ] + list(_scalings(sample))
+    mistakes = [*map(_of_view, CONVENTIONS), *camera_mistakes(list(sample.views.values()))]
+    candidates = [_Candidate(it.text, *_score_with(sample, it.correct), it.rarity) for it in mistakes]
+    candidates += _scalings(sample)
     fitting = [it for it in candidates if it.bad_share < BAD_SHARE and it.error_px < GAIN * given]
     if fitting:
         return _named(fitting)
@@ -78,12 +77,10 @@ def explain(views: Views, matched: Sequence[MatchedPair], given_px: float | None
         return Explanation(text)
     if apart := _sessions(views, matched, sample.measure()):
         return apart
-    mixed = [
-        (_mixed(sample, text, correct), rarity) for text, correct, rarity in corrections if rarity < STRANGE
-    ]  # perhaps it was made with some photographs only
-    found = [it for it in mixed if it[0].text]
-    least = min((rarity for _, rarity in found), default=USUAL)
-    return min((it for it, rarity in found if rarity == least), key=lambda it: it.error_px, default=Explanation())
+    # Perhaps a mistake was made with some photographs only.
+    mixed = [(it.rarity, _mixed(sample, it)) for it in mistakes if it.rarity < STRANGE]
+    found = [(rarity, it) for rarity, it in mixed if it.text]
+    return min(found, key=lambda it: (it[0], it[1].error_px), default=(USUAL, Explanation()))[1]
 
 
 def _sessions(views: Views, matched: Sequence[MatchedPair], errors: Sequence[PairError]) -> Explanation | None:
@@ -113,11 +110,11 @@ def _named(fitting: Sequence[_Candidate]) -> Explanation:
     return Explanation("; or ".join(it.text for it in named), named[0].error_px)
 
 
-def _corrections(views: Mapping[int, PosedView]) -> Iterator[tuple[str, ViewCorrection, int]]:
-    for convention in CONVENTIONS:
-        yield convention.text, on_view(convention.correct), convention.rarity
-    for mistake in camera_mistakes(list(views.values())):
-        yield mistake.text, mistake.correct, mistake.rarity
+def _of_view(convention: Convention) -> Mistake[PosedView]:
+    def correct(view: PosedView) -> PosedView:
+        return replace(view, world_from_camera=convention.correct(view.world_from_camera))
+
+    return Mistake(convention.text, correct, convention.rarity)
 
 
 def _score(errors: Sequence[PairError]) -> tuple[float, float]:
@@ -126,7 +123,7 @@ def _score(errors: Sequence[PairError]) -> tuple[float, float]:
     return float(np.median(costs)), float(np.mean([it.is_bad for it in errors]))
 
 
-def _score_with(sample: PairSample, change: ViewCorrection) -> tuple[float, float]:
+def _score_with(sample: PairSample, change: Callable[[PosedView], PosedView]) -> tuple[float, float]:
     return _score(sample.measure({i: change(view) for i, view in sample.views.items()}))
 
 
@@ -148,16 +145,12 @@ def _scalings(sample: PairSample) -> Iterator[_Candidate]:
 
 def _unset(sample: PairSample) -> Iterator[_Candidate]:
     """A focal length of no camera: the one that fits, with the principal point in the image's centre."""
-    starts = [
-        (_score_with(sample, lambda view, it=field: with_camera(view, of_field(view.view.camera, it))), field)  # type: ignore[misc]
-        for field in FIELDS_DEG
-    ]
-    (_, _), field = min(starts, key=lambda it: it[0][0])
 
-    def scaled_field(view: PosedView, scale: float) -> PosedView:
-        return focal_scaled(with_camera(view, of_field(view.view.camera, field)), scale)
+    def with_field(view: PosedView, field_deg: float) -> PosedView:
+        return with_camera(view, of_field(view.view.camera, field_deg))
 
-    scale, error_px, bad_share = best_scale(sample, scaled_field)
+    field = min(FIELDS_DEG, key=lambda deg: _score_with(sample, lambda view: with_field(view, deg))[0])
+    scale, error_px, bad_share = best_scale(sample, lambda view, scale: focal_scaled(with_field(view, field), scale))
     cameras = [it.view.camera for it in sample.views.values()]
     given = np.median([it.focal_x_px for it in cameras])
     found = np.median([scale * of_field(it, field).focal_x_px for it in cameras])
@@ -183,22 +176,20 @@ def best_scale(sample: PairSample, change: Callable[[PosedView, float], PosedVie
     return scale, *score_at(scale)
 
 
-def _mixed(sample: PairSample, text: str, correction: ViewCorrection) -> Explanation:
+def _mixed(sample: PairSample, mistake: Mistake[PosedView]) -> Explanation:
     """Explains pairs by correcting either, both or none of their photographs; empty if that does not fit."""
-    turned = {i: correction(view) for i, view in sample.views.items()}
-    count = len(sample.pairs)
-    measured = [sample.measure(), sample.measure(turned, sample.views)]
-    measured += [sample.measure(sample.views, turned), sample.measure(turned)]
+    views, corrected = sample.views, {i: mistake.correct(view) for i, view in sample.views.items()}
+    choices = ((views, views), (corrected, views), (views, corrected), (corrected, corrected))
+    measured = [sample.measure(*it) for it in choices]
     best: list[PairError] = []
     votes: Counter[int] = Counter()
-    for row in range(count):
-        options = [_score([errors[row]])[0] for errors in measured]
-        chosen = int(np.argmin(options))
-        best.append(measured[chosen][row])
-        for side, i in enumerate(sample.pairs[row]):
+    for errors in zip(*measured, strict=True):
+        chosen = int(np.argmin([_score([it])[0] for it in errors]))
+        best.append(errors[chosen])
+        for side, i in enumerate(errors[chosen].pair):
             votes[i] += 1 if chosen in ((1, 3), (2, 3))[side] else -1
     error_px, bad_share = _score(best)
     concerned = tuple(sorted(i for i, votes_for in votes.items() if votes_for > 0))
     if bad_share >= MIXED_BAD_SHARE or not concerned:
         return Explanation()
-    return Explanation(f"with some photographs, not all, {text}", error_px, concerned)
+    return Explanation(f"with some photographs, not all, {mistake.text}", error_px, concerned)

@@ -5,15 +5,15 @@ of a K that was never set. What was meant is then unknown, and the image's centr
 """
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from mapless.geometry import Camera
+from mapless.geometry import Camera, RigidTransform
 
 from ...features.views import PosedView, undistort_pixels
-from .conventions import RARE, USUAL, ViewCorrection, turned_camera
+from .conventions import RARE, USUAL, Mistake
 
 LEAST_FOCAL_SHARE = 0.1
 """Share of the image's longer side; a shorter focal length would be a pinhole with more than 157 degrees of view."""
@@ -21,15 +21,6 @@ SAME_SHARE = 0.01
 """Share of the image's longer side; coordinates that differ by less cannot be distinguished."""
 FIELDS_DEG = (30.0, 45.0, 60.0, 75.0, 90.0, 110.0, 130.0)
 """Horizontal fields of view from which a focal length that is unknown is searched."""
-
-
-@dataclass(frozen=True, eq=False)
-class CameraMistake:
-    """A mistake in intrinsics: how it is named, its correction, and how common it is."""
-
-    text: str
-    correct: ViewCorrection
-    rarity: int
 
 
 def with_camera(posed: PosedView, camera: Camera) -> PosedView:
@@ -71,48 +62,41 @@ def _swapped_focal(camera: Camera) -> Camera:
 
 
 def _swapped_principal(camera: Camera) -> Camera:
-    # Exchanged in the photograph as it was given, where (0, 0) is the first pixel's centre as here.
     return replace(camera, principal_x_px=camera.principal_y_px, principal_y_px=camera.principal_x_px)
 
 
-def camera_mistakes(views: Sequence[PosedView]) -> Iterator[CameraMistake]:
-    """The mistakes that these views may have; none whose correction would change next to nothing."""
+def camera_mistakes(views: Sequence[PosedView]) -> Iterator[Mistake[PosedView]]:
+    """The mistakes that these views, one at least, may have; none whose correction would change next to nothing."""
     cameras = [view.view.camera for view in views]
-    if not cameras:
-        return
-    sides = np.array([max(it.width_px, it.height_px) for it in cameras])
     if all(map(is_at_first_pixel, cameras)):
         if not any(map(is_unset, cameras)):
-            yield CameraMistake(
+            text = (
                 "K is given by columns, or its last column is missing: the principal point (cx, cy) is 0 0, and one in "
-                "the image's centre fits",
-                lambda view: with_camera(view, centred(view.view.camera)),
-                USUAL,
+                "the image's centre fits"
             )
-    elif _differ([it.principal_x_px - it.principal_y_px for it in cameras], sides):
-        yield CameraMistake(
-            "cx and cy are exchanged", lambda view: with_camera(view, _swapped_principal(view.view.camera)), USUAL
-        )
-    if _differ([it.focal_x_px - it.focal_y_px for it in cameras], sides):
-        yield CameraMistake(
-            "fx and fy are exchanged", lambda view: with_camera(view, _swapped_focal(view.view.camera)), USUAL
-        )
+            yield _mistake(text, centred)
+    elif _differ(cameras, lambda it: it.principal_x_px - it.principal_y_px):
+        yield _mistake("cx and cy are exchanged", _swapped_principal)
+    if _differ(cameras, lambda it: it.focal_x_px - it.focal_y_px):
+        yield _mistake("fx and fy are exchanged", _swapped_focal)
     for quarters in (1, 2, 3):
-        yield CameraMistake(
-            f"poses and intrinsics are of images turned by {90 * quarters} degrees (EXIF orientation)",
-            turned(quarters),
-            RARE,
-        )
+        text = f"poses and intrinsics are of images turned by {90 * quarters} degrees (EXIF orientation)"
+        yield Mistake(text, turned(quarters), RARE)
 
 
-def _differ(differences_px: Sequence[float], sides: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> bool:
-    return bool(np.median(np.abs(differences_px) / sides) > SAME_SHARE)
+def _mistake(text: str, change: Callable[[Camera], Camera]) -> Mistake[PosedView]:
+    return Mistake(text, lambda view: with_camera(view, change(view.view.camera)), USUAL)
+
+
+def _differ(cameras: Sequence[Camera], difference_px: Callable[[Camera], float]) -> bool:
+    """Whether two numbers of the cameras differ by a share of the images' longer sides that can be distinguished."""
+    return bool(np.median([abs(difference_px(it)) / max(it.width_px, it.height_px) for it in cameras]) > SAME_SHARE)
 
 
 _QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-def turned(quarters: int) -> ViewCorrection:
+def turned(quarters: int) -> Callable[[PosedView], PosedView]:
     """Correction of a photograph that was turned so often to the left, without its pose and its intrinsics."""
 
     def correct(view: PosedView) -> PosedView:
@@ -122,7 +106,8 @@ def turned(quarters: int) -> ViewCorrection:
         for remaining in range(quarters, 0, -1):
             fx, fy, x, y = fy, fx, y, sides_px[remaining % 2] - 1 - x
         camera = replace(camera, focal_x_px=fx, focal_y_px=fy, principal_x_px=x, principal_y_px=y)
-        pose = turned_camera(np.linalg.matrix_power(_QUARTER, quarters))(view.world_from_camera)
+        rotation = view.world_from_camera.rotation @ np.linalg.matrix_power(_QUARTER, quarters)
+        pose = RigidTransform(rotation, view.world_from_camera.translation)
         return replace(view, view=replace(view.view, camera=camera), world_from_camera=pose)
 
     return correct

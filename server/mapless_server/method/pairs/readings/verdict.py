@@ -14,7 +14,7 @@ from .explanation import explain
 from .repeats import contradicting_groups, same_photographs
 
 WRONG_SHARE = 0.4
-"""More bad pairs than one photograph in five could make."""
+"""Share of bad pairs above which the scene as a whole is wrong: more than one photograph in five could make."""
 LEFT_SHARE = 0.25
 """Share of a wrong scene's bad pairs that may remain without the suspects, if these are the reason."""
 _SUSPECT_SHARE = 0.6
@@ -65,20 +65,12 @@ def judge(
     excluded = {i for group in groups for i in group}
     matched = [item for item in matched if not excluded & set(item.pair)]
     errors = [error for error in errors if not excluded & set(error.pair)]
-    verdict = Verdict((), unmatched_count, math.nan, math.nan, MAX_ERROR_PX, same_pose=tuple(groups))
     if not errors:
-        return verdict
-    median_px, bad_share = summary(errors)
+        return Verdict((), unmatched_count, math.nan, math.nan, MAX_ERROR_PX, same_pose=tuple(groups))
+    (median_px, bad_share), twins = summary(errors), tuple(same_photographs(views, matched))
     threshold_px = float(np.median([error.threshold_px for error in errors]))
-    twins = tuple(same_photographs(views, matched))
-    verdict = replace(
-        verdict,
-        pairs=tuple(errors),
-        median_px=median_px,
-        bad_share=bad_share,
-        threshold_px=threshold_px,
-        same_photograph=twins,
-    )
+    verdict = Verdict(tuple(errors), unmatched_count, median_px, bad_share, threshold_px)
+    verdict = replace(verdict, same_pose=tuple(groups), same_photograph=twins)
     if not verdict.is_wrong:
         return replace(verdict, median_depth=median_depth(views, matched), suspects=suspects_of(errors))
     found = explain(views, matched)
