@@ -153,12 +153,17 @@ class PosedSupport(Support):
 
     def inliers_by_reference(self) -> tuple[int, ...]:
         """Number of inliers on points that each reference observes, and of two-view inliers with it."""
-        agreeing = np.zeros(len(self.structure.x_in_world), bool)
-        agreeing[self.matches.point[self.estimate.inliers]] = True
-        seen = self.structure.tracks.view[agreeing[self.structure.tracks.point]]
+        seen = observers(self.structure, self.matches.point[self.estimate.inliers])
         if self.two_view is not None:
             seen = np.concatenate([seen, self.two_view.reference[self.two_view.inliers]])
         return tuple(np.bincount(seen, minlength=len(self.references)).tolist())
+
+
+def observers(structure: Structure, points: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Index of the reference (O,) of each observation of some of the points, by their indices."""
+    is_chosen = np.zeros(len(structure.x_in_world), bool)
+    is_chosen[points] = True
+    return structure.tracks.view[is_chosen[structure.tracks.point]]
 
 
 TAIL_95 = 1.47

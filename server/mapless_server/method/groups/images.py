@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle.estimate import Support
+from ..bundle.estimate import Support, observers
 from ..bundle.priors import NO_PRIORS, Priors
-from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..judge.answer import Answer, Localization
 from ..judge.evidence import findable_count, hull_share
 from ..judge.references import moved_matches, without
@@ -24,7 +23,7 @@ from ..pose.generalized import CameraMatches
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms
 from ..rejection import Rejection, RejectionReason
 from ..structure.match import MatchOptions, search
-from ..structure.model import PointMatches, ScaleSource, Structure
+from ..structure.model import PointMatches, ScaleSource
 
 INLIER_PX = PnpOptions().inlier_px
 """Largest reprojection error of an inlier, as for one photograph."""
@@ -57,42 +56,30 @@ class GroupImage:
     priors: Priors = NO_PRIORS
 
 
-@dataclass(frozen=True, eq=False)
-class MatchedImage:
-    """A photograph with matches, in the world of its group.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MatchedImage(Support):
+    """A photograph with matches that do not depend on a pose of it, in the world of its group.
 
     Attributes:
         image: its index in the group.
-        query: the photograph.
-        references: in the order that the structure's tracks number them.
-        structure: metric points.
-        tracked: matches that do not depend on a pose of the photograph.
         own_pose: world_from_camera of its own answer; None if it is rejected.
         own_covariance: (6, 6) covariance of `own_pose`, order x y z rx ry rz, fixed world axes, metres and radians.
         match: see GroupImage.
-        query_matches: matches of the photograph with each reference.
-        reference_error_px: returns the error of a pair of references, see `agreement`; None if it is not known.
     """
 
     image: int
-    query: View
-    references: tuple[PosedView, ...]
-    structure: Structure
-    tracked: PointMatches
     own_pose: RigidTransform | None
     own_covariance: Array | None
     match: MatchOptions
-    query_matches: tuple[Matches, ...] = ()
-    reference_error_px: ReferenceErrors | None = None
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
-        """Returns the tracked matches as pixels and points of a camera with this pose in the rig."""
-        return CameraMatches(self.tracked.seen(self.query, self.structure.x_in_world), rig_from_camera)
+        """Returns the matches as pixels and points of a camera with this pose in the rig."""
+        return CameraMatches(self.matches.seen(self.query, self.structure.x_in_world), rig_from_camera)
 
     def matches_at(self, world_from_camera: RigidTransform) -> PointMatches:
-        """Returns the tracked matches and those of a guided search from a pose."""
-        found = search(self.query, self.references, self.structure, world_from_camera, self.tracked, self.match)
-        matches = self.tracked.and_last(found.point, found.keypoint, found.guided)
+        """Returns the matches and those of a guided search from a pose."""
+        found = search(self.query, self.references, self.structure, world_from_camera, self.matches, self.match)
+        matches = self.matches.and_last(found.point, found.keypoint, found.guided)
         return replace(matches, radius_px=self.match.radius_px)
 
 
@@ -116,17 +103,21 @@ class PosedImage:
 
     def inliers_by_reference(self) -> tuple[int, ...]:
         """Number of inliers on points that each reference observes."""
-        structure, count = self.source.structure, len(self.source.references)
-        agreeing = np.zeros(len(structure.x_in_world), bool)
-        agreeing[self.matches.point[self.inliers]] = True
-        seen = structure.tracks.view[agreeing[structure.tracks.point]]
-        return tuple(np.bincount(seen, minlength=count).tolist())
+        seen = observers(self.source.structure, self.matches.point[self.inliers])
+        return tuple(np.bincount(seen, minlength=len(self.source.references)).tolist())
+
+    def findable_count(self) -> int:
+        """Number of points that should be visible."""
+        return findable_count(self.source.query, self.source.structure.x_in_world, self.world_from_camera)
+
+    def hull_share(self) -> float:
+        """Share of the image that the convex hull of the inliers covers."""
+        return hull_share(self.source.query, self.matches, self.inliers)
 
     def moved(self) -> PosedImage:
         """Without matches at the same pixels as in the references, see `judge.references`."""
-        it = self.source
-        given = it.query, it.references, it.structure, self.matches, it.query_matches
-        kept = moved_matches(*given, StationaryOptions())
+        support = replace(self.source, matches=self.matches)
+        kept = moved_matches(support, support.query_matches, StationaryOptions())
         return replace(
             self, matches=self.matches.select(kept), inliers=self.inliers[kept], errors_px=self.errors_px[kept]
         )
@@ -152,16 +143,23 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
     references = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in support.references)
     # Matches from a guided search around a rejected pose would be evidence for that pose.
     guided = support.matches.guided
-    kept = np.flatnonzero(~guided) if not guided.all() or isinstance(outcome, Rejection) else np.arange(len(guided))
-    tracked = PointMatches(
-        support.matches.point[kept], support.matches.keypoint[kept], guided[kept], support.matches.radius_px
-    )
+    is_kept = ~guided if not guided.all() or isinstance(outcome, Rejection) else guided
     own_pose, own_covariance = None, None
     if isinstance(outcome, Localization):
         own_pose, own_covariance = outcome.world_from_camera.shifted(-origin), outcome.covariance
-    query = support.query
-    matched = support.query_matches, support.reference_error_px
-    return MatchedImage(index, query, references, structure, tracked, own_pose, own_covariance, image.match, *matched)
+    return MatchedImage(
+        query=support.query,
+        references=references,
+        structure=structure,
+        matches=support.matches.select(is_kept),
+        origin=origin,
+        query_matches=support.query_matches,
+        reference_error_px=support.reference_error_px,
+        image=index,
+        own_pose=own_pose,
+        own_covariance=own_covariance,
+        match=image.match,
+    )
 
 
 def priors_of(images: Sequence[GroupImage], origin: Array) -> dict[int, Priors]:
@@ -186,7 +184,7 @@ def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
 def group_gate_failure(matched: Sequence[PosedImage]) -> str | None:
     """Returns why the pose of a group fails the gate; None if it passes.
 
-    `gate.gate_failure` with sums over the photographs; besides, a share of the points must be found, over more than a
+    `pnp.gate_failure` with sums over the photographs; besides, a share of the points must be found, over more than a
     corner of the image.
     """
     inlier_total = sum(int(it.inliers.sum()) for it in matched)
@@ -197,13 +195,10 @@ def group_gate_failure(matched: Sequence[PosedImage]) -> str | None:
         expected = group_log10_false_alarms(some)
         if expected > MAX_LOG10_FALSE_ALARMS:
             return f"{begin}, which chance could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
-    visible = sum(
-        findable_count(it.source.query, it.source.structure.x_in_world, it.world_from_camera) for it in matched
-    )
+    visible = sum(it.findable_count() for it in matched)
     if inlier_total < min(MIN_FOUND_SHARE * visible, ENOUGH_INLIERS):
         return f"{count}, but they should show {visible} points: repeated structure somewhere else, most likely"
-    shares = (hull_share(it.source.query, it.matches, it.inliers) for it in matched if it.inliers.sum() >= 3)
-    covered = sum(shares)
+    covered = sum(it.hull_share() for it in matched)
     if covered < MIN_HULL_SHARE:
         return f"{count}, but they cover only {100 * covered:.1f} % of an image"
     return None
@@ -215,7 +210,7 @@ def _agreeing(matched: Sequence[PosedImage]) -> str:
 
 
 def group_log10_false_alarms(matched: Sequence[PosedImage]) -> float:
-    """`gate.log10_false_alarms` of all matches, with the largest chance of an inlier of any photograph."""
+    """`pnp.log10_false_alarms` of all matches, with the largest chance of an inlier of any photograph."""
     disc = INLIER_PX**2
     expected = []
     for guided in (False, True):

@@ -1,5 +1,6 @@
 """The cost of a group of photographs and its derivatives; see `joint`."""
 
+import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,11 +32,7 @@ MAX_MATCHES = 300
 
 
 class GroupState(Protocol):
-    """The poses of a group as values of N parameters, which have a cost of their own.
-
-    Attributes:
-        size: the number N of parameters.
-    """
+    """The poses of a group as values of N parameters, which may have a cost of their own."""
 
     @property
     def size(self) -> int:
@@ -56,15 +53,15 @@ class GroupState(Protocol):
 
     def relaxed(self: S) -> S:
         """Returns the same poses with the cost's standard deviations enlarged to the observed errors."""
-        ...
+        return self
 
     def cost(self) -> float:
         """The cost of the parameters, without that of the observations."""
-        ...
+        return 0.0
 
     def equations(self) -> tuple[Array, Array]:
         """Returns J^T J (N, N) and J^T r (N,) of this cost."""
-        ...
+        return np.zeros((self.size, self.size)), np.zeros(self.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,26 +91,19 @@ def part_of(source: MatchedImage, matches: PointMatches, state: GroupState) -> P
     return Part(source, pose, np.flatnonzero(chosen), tracks)
 
 
-class Shared:
-    """Counts how often each measured keypoint is used in a group."""
-
-    def __init__(self, parts: Sequence[Part]) -> None:
-        self._times: Counter[object] = Counter()
-        for part in parts:
-            self._times.update(_measurements(part))
-
-    def times(self, part: Part) -> Array:
-        """Number of uses (O,) in the group of each observation of a part."""
-        return np.array([self._times[it] for it in _measurements(part)], np.float64)
+def times_used(parts: Sequence[Part]) -> list[Array]:
+    """How often the measured keypoint of each observation (O,) of each part is used in the whole group."""
+    measured = [_measurements(part) for part in parts]
+    times = Counter(itertools.chain.from_iterable(measured))
+    return [np.array([times[it] for it in its], np.float64) for its in measured]
 
 
 def _measurements(part: Part) -> list[object]:
     """Identity of each observation: its photograph and keypoint."""
-    views = [it.view for it in part.source.references]
-    # Named by its keypoints: a photograph that was sent twice is one measurement.
-    names: list[object] = [it.key for it in part.source.references]
-    names.append(part.source.query.features.keypoints.tobytes())
-    keypoints = [it.features.keypoints for it in (*views, part.source.query)]
+    source = part.source
+    keypoints = [it.features.keypoints for it in (*(r.view for r in source.references), source.query)]
+    # The query is named by its keypoints: a photograph that was sent twice is one measurement.
+    names = [*(r.key for r in source.references), keypoints[-1].tobytes()]
     rows = zip(part.tracks.view.tolist(), part.tracks.keypoint.tolist(), strict=True)
     return [(names[v], *keypoints[v][k].tolist()) for v, k in rows]
 
@@ -186,15 +176,12 @@ class GroupProblem(Generic[S]):
         self.blocks: list[ImageBlock] = []
         self.chosen: list[NDArray[np.intp]] = []
         points: list[Array] = []
-        parts = [
-            part_of(source, its_matches, state) for source, its_matches in zip(matched_images, matches, strict=True)
-        ]
-        used = [part for part in parts if len(part.chosen)]
-        shared = Shared(used)
-        for part in used:
+        parts = [part_of(source, its, state) for source, its in zip(matched_images, matches, strict=True)]
+        parts = [part for part in parts if len(part.chosen)]
+        for part, times in zip(parts, times_used(parts), strict=True):
             self.chosen.append(part.chosen)
             points.append(part.source.structure.x_in_world[part.chosen])
-            self.blocks.append(self._block(part, shared))
+            self.blocks.append(self._block(part, times))
         references = Poses.of(reference.world_from_camera for _, reference in self._references.values())
         self.start = Point(references, tuple(points), state)
         self.information = self._reference_information() if self.blocks else np.zeros((0, 0))
@@ -204,11 +191,11 @@ class GroupProblem(Generic[S]):
         """Number of different references of all photographs."""
         return len(self._references)
 
-    def _block(self, part: Part, shared: Shared) -> ImageBlock:
+    def _block(self, part: Part, times: Array) -> ImageBlock:
         source, structure = part.source, part.source.structure
         views = [*source.references, PosedView("", "", source.query, part.world_from_camera)]
         observations, start, depth_m = bundle_of(part.tracks, views, structure, part.chosen)
-        observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(shared.times(part)))
+        observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(times))
         references = np.array([self._index(it) for it in source.references])
         planes = None if structure.planes is None else structure.planes[part.chosen]
         problem = BundleProblem.of(observations, start.poses[:-1], ADJUST.loss_scale_sigma, planes)

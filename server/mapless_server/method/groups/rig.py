@@ -26,6 +26,7 @@ from .images import (
     rejection_without_matches,
 )
 from .joint import adjust_in_rounds
+from .problem import GroupState
 from .trust import trust_of_group
 
 PNP = PnpOptions()
@@ -54,13 +55,16 @@ class RigEstimate:
 
 
 @dataclass(frozen=True, eq=False)
-class RigState:
-    """The pose of a rig; see `problem.GroupState`. Its parameters are a left perturbation (v, w) of rig_from_world."""
+class RigState(GroupState):
+    """The pose of a rig, which has no cost. Its parameters are a left perturbation (v, w) of rig_from_world."""
 
     rig_from_world: RigidTransform
     rig_from_camera: tuple[RigidTransform, ...]
 
-    size = 6
+    @property
+    def size(self) -> int:
+        """See GroupState."""
+        return 6
 
     def camera_from_world(self, image: int) -> RigidTransform:
         """See GroupState."""
@@ -76,18 +80,6 @@ class RigState:
     def moved(self, step: Array) -> "RigState":
         """See GroupState."""
         return RigState(perturbed(self.rig_from_world, step), self.rig_from_camera)
-
-    def relaxed(self) -> "RigState":
-        """The state itself: a rig is rigid."""
-        return self
-
-    def cost(self) -> float:
-        """Zero: a rig is rigid."""
-        return 0.0
-
-    def equations(self) -> tuple[Array, Array]:
-        """See GroupState."""
-        return np.zeros((6, 6)), np.zeros(6)
 
 
 def solve_rig(
@@ -110,8 +102,7 @@ def solve_rig(
     estimate = adjust_in_rounds(matched_images, state, priors_of(images, origin))
     if estimate.inlier_count < 4:
         return Rejection(RejectionReason.PNP_FAILED, "no pose of the rig explains four matches")
-    failure = group_gate_failure(estimate.matched)
-    if failure:
+    if failure := group_gate_failure(estimate.matched):
         return Rejection(RejectionReason.GATE, failure)
     trust, doubt = trust_of_group(estimate.matched, coverage)
     if doubt:

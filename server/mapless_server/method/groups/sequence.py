@@ -1,11 +1,8 @@
 """The poses of a short sequence: photographs of one camera with the poses that the device tracked.
 
 Four steps: jumps of the tracking are found where photographs are localized alone (see `jumps`), and cut the sequence
-into parts; every frame gets an initial pose, its own or one tracked from the nearest frame of its part that has one; a
-joint adjustment with a switch on each tracked step (see `drift`); and the last frames are checked against the result.
-
-If no frame is localized alone, the initial world_from_session is found from the matches of all (generalized PnP, the
-whole sequence as one camera).
+into parts; every frame gets an initial pose (see `start`); a joint adjustment with a switch on each tracked step (see
+`drift`); and the last frames are checked against the result.
 
 So drift does not affect frames with good matches, and accurate tracking poses those without. A frame is never posed
 across a step that the photographs contradict: the last frame's part is answered, if its own photographs localize it.
@@ -20,7 +17,6 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import PriorCheck, Priors
-from ..judge.evidence import findable_count
 from ..optim.optimize import covariance_in_world
 from ..pose.pnp import MIN_MATCHES
 from ..rejection import Rejection, RejectionReason
@@ -101,7 +97,7 @@ def solve_sequence(
     session = Session(tuple(session_from_camera), estimate_scale, priors_of(images, origin), unit)
     if estimate_scale and not session.moves:
         return Rejection(RejectionReason.SCALE_UNRELIABLE, "the session does not move: its unit cannot be determined")
-    total = sum(len(it.tracked) for it in matched_images)
+    total = sum(len(it.matches) for it in matched_images)
     if total < MIN_MATCHES:
         message = f"{total} 2D-3D matches in {len(matched_images)} frames, {MIN_MATCHES} needed"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
@@ -118,9 +114,7 @@ def solve_sequence(
             return found
         start, estimate = found
     last_part = [it for it in estimate.matched if it.source.image in start.last_part]
-    trust, rejection = 0.0, _rejection(estimate, last_part)
-    if rejection is None:
-        trust, rejection = trust_of_group(last_part, coverage)
+    trust, rejection = _judged(estimate, last_part, coverage)
     if rejection is not None:
         cut = [it.described(unit) for it in start.jumps]
         return replace(rejection, message="; ".join([*cut, rejection.message]))
@@ -138,18 +132,19 @@ def _estimated(
     return start, adjust_in_rounds(matched_images, state, session.priors)
 
 
-def _rejection(estimate: JointEstimate[SequenceState], last_part: Sequence[PosedImage]) -> Rejection | None:
-    """Rejects the poses if the photographs since the last jump, or the session's scale, do not support them."""
+def _judged(
+    estimate: JointEstimate[SequenceState], last_part: Sequence[PosedImage], coverage: float
+) -> tuple[float, Rejection | None]:
+    """The trust in the photographs since the last jump; a rejection if they, or the scale, do not support the poses."""
     if sum(int(it.inliers.sum()) for it in last_part) < 4:
-        return Rejection(RejectionReason.PNP_FAILED, "no poses of the sequence explain four matches")
-    failure = group_gate_failure(last_part)
-    if failure:
-        return Rejection(RejectionReason.GATE, failure)
+        return 0.0, Rejection(RejectionReason.PNP_FAILED, "no poses of the sequence explain four matches")
+    if failure := group_gate_failure(last_part):
+        return 0.0, Rejection(RejectionReason.GATE, failure)
     sigma = _scale_sigma(estimate)
     if not sigma <= MAX_SCALE_SIGMA:
         message = f"the session moves too little for its unit: the scale is known to {100 * sigma:.0f} % only"
-        return Rejection(RejectionReason.SCALE_UNRELIABLE, message)
-    return None
+        return 0.0, Rejection(RejectionReason.SCALE_UNRELIABLE, message)
+    return trust_of_group(last_part, coverage)
 
 
 def _last_contradicted(estimate: JointEstimate[SequenceState], frame_count: int) -> PosedImage | None:
@@ -157,7 +152,7 @@ def _last_contradicted(estimate: JointEstimate[SequenceState], frame_count: int)
     last = estimate.matched[-1]
     if last.source.image != frame_count - 1 or last.source.own_pose is not None:
         return None
-    if max(_visible(last), len(last.source.tracked)) < SHOULD_SHOW:
+    if max(last.findable_count(), len(last.source.matches)) < SHOULD_SHOW:
         return None
     sigma = np.sqrt(np.diag(estimate.covariance)[6 * (frame_count - 1) :][:6])
     source, focal_px = last.source, last.source.query.camera.focal_x_px
@@ -167,11 +162,6 @@ def _last_contradicted(estimate: JointEstimate[SequenceState], frame_count: int)
     bound_px = LOOSE_PX + 3 * focal_px * (max(sigma[:3]) / max(distance_m, 1e-9) + max(sigma[3:]))
     near = int((last.errors_px[~last.matches.guided] < bound_px).sum())
     return last if near < LEAST_NEAR else None
-
-
-def _visible(matched: PosedImage) -> int:
-    """Number of points that should be visible."""
-    return findable_count(matched.source.query, matched.source.structure.x_in_world, matched.world_from_camera)
 
 
 def _posed_by_themselves(
@@ -190,21 +180,16 @@ def _posed_by_themselves(
     ):
         message = (
             f"the last photograph contradicts its tracked pose: {int(last.inliers.sum())} of its {len(last.matches)} "
-            f"matches agree, and {_visible(last)} points should be visible; the tracking may have jumped, and the "
-            "photograph is not localized without it"
+            f"matches agree, and {last.findable_count()} points should be visible; the tracking may have jumped, and "
+            "the photograph is not localized without it"
         )
         return Rejection(RejectionReason.GATE, message)
-    origin, poses = matched_images_of(images)[0], alone.world_from_camera
-    return [
-        replace(
-            it,
-            own_pose=poses[it.image - first].shifted(-origin),
-            own_covariance=alone.covariances[it.image - first],
-        )
-        if it.image >= first
-        else it
-        for it in matched_images
-    ]
+
+    def posed_as_found(it: MatchedImage) -> MatchedImage:
+        own_pose = alone.world_from_camera[it.image - first].shifted(-it.origin)
+        return replace(it, own_pose=own_pose, own_covariance=alone.covariances[it.image - first])
+
+    return [posed_as_found(it) if it.image >= first else it for it in matched_images]
 
 
 def _scale_sigma(estimate: JointEstimate[SequenceState]) -> float:
@@ -245,11 +230,7 @@ def _at_least(covariance: Array, least: Array) -> Array:
 
 
 def _result(
-    estimate: JointEstimate[SequenceState],
-    start: Start,
-    session: Session,
-    origin: Array,
-    trust: float,
+    estimate: JointEstimate[SequenceState], start: Start, session: Session, origin: Array, trust: float
 ) -> SequenceEstimate:
     state = estimate.state
     poses = [frame.inverse() for frame in state.frames]

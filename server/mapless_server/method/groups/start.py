@@ -104,7 +104,7 @@ class Session:
         if chain is None:
             guess = self._of_all_matches([it.camera_matches(self.frames[it.image]) for it in matched_images])
             if guess is None:
-                total = sum(len(it.tracked) for it in matched_images)
+                total = sum(len(it.matches) for it in matched_images)
                 message = f"no poses of the sequence explain four of {total} matches"
                 return Rejection(RejectionReason.PNP_FAILED, message)
             return Start(tuple(guess.transform_pose(frame) for frame in self.frames), guess.scale)

@@ -19,13 +19,10 @@ from ..judge.evidence import (
     PNP,
     SPLITS,
     Evidence,
-    Votes,
     epipolar_share,
     expected_share,
-    findable_count,
     half_of_references,
-    hull_share,
-    votes_on,
+    votes_of,
 )
 from ..judge.judge import JudgeOptions, low_trust, trust_of
 from ..judge.references import Supporters, disagreeing_references
@@ -42,20 +39,15 @@ def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[floa
     """
     sources = [it.source for it in matched]
     inliers = [int(it.inliers.sum()) for it in matched]
-    findable = [findable_count(it.source.query, it.source.structure.x_in_world, it.world_from_camera) for it in matched]
+    findable = [it.findable_count() for it in matched]
     expected = [expected_share(it.structure, it.references) for it in sources]
-    hulls = [
-        hull_share(it.source.query, it.matches, it.inliers)
-        for it, count in zip(matched, inliers, strict=True)
-        if count >= 3
-    ]
     distance_m = _distance_m(matched)
     evidence = Evidence(
         sum(inliers),
         sum(len(it.matches) for it in matched),
         min(1.0, sum(inliers) / max(1, sum(findable))),
         float(np.average(expected, weights=np.maximum(findable, 1))),
-        min(1.0, sum(hulls)),
+        min(1.0, sum(it.hull_share() for it in matched)),
         float(np.average([_epipolar_share(it) for it in matched], weights=np.maximum(inliers, 1))),
         _matches_apart(matched, distance_m),
         _references_apart(matched, distance_m),
@@ -84,7 +76,7 @@ def _distance_m(matched: Sequence[PosedImage]) -> float:
 
 
 def _matches_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
-    """`agreement.disagreement_of_matches` for all photographs together."""
+    """`evidence.disagreement_of_matches` for all photographs together."""
     cameras = []
     for it, mounting in zip(matched, _mounting(matched), strict=True):
         seen = it.matches.unguided().seen(it.source.query, it.source.structure.x_in_world)
@@ -97,12 +89,12 @@ def _matches_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
 
 
 def _references_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
-    """`agreement.disagreement_of_references` for all photographs; a reference is in the same half for all of them."""
+    """`evidence.disagreement_of_references` for all photographs; a reference is in the same half for all of them."""
     cameras, owners, keypoints = [], [], []
     names: dict[str, int] = {}
     for it, mounting in zip(matched, _mounting(matched), strict=True):
         source = it.source
-        votes = _votes(it)
+        votes = votes_of(source, source.query_matches)
         number = np.array([names.setdefault(r.key, len(names)) for r in source.references], np.intp)
         cameras.append(CameraMatches(votes.seen, mounting))
         owners.append(number[votes.reference])
@@ -120,11 +112,6 @@ def _epipolar_share(matched: PosedImage) -> float:
     source = matched.source
     counts, pose = matched.inliers_by_reference(), matched.world_from_camera
     return epipolar_share(source.query, source.references, source.query_matches, counts, pose)
-
-
-def _votes(matched: PosedImage) -> Votes:
-    source = matched.source
-    return votes_on(source.query, source.references, source.structure, source.query_matches)
 
 
 def _mounting(matched: Sequence[PosedImage]) -> list[RigidTransform]:

@@ -86,13 +86,7 @@ class Votes:
 
 def votes_of(support: Support, query_matches: Sequence[Matches]) -> Votes:
     """The matches of a support's query with keypoints of triangulated points."""
-    return votes_on(support.query, support.references, support.structure, query_matches)
-
-
-def votes_on(
-    query: View, references: Sequence[PosedView], structure: Structure, query_matches: Sequence[Matches]
-) -> Votes:
-    """The matches of a query with keypoints of a structure's points; `references` in the order of its tracks."""
+    query, references, structure = support.query, support.references, support.structure
     tracks = structure.tracks
     offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in references])])
     point_of = np.full(offsets[-1], -1)

@@ -19,14 +19,13 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle.estimate import PosedSupport
+from ..bundle.estimate import PosedSupport, Support
 from ..features.tracks import keypoint_offsets
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..pairs.agreement import MAX_ERROR_PX
 from ..pairs.stationary import StationaryOptions, have_same_shape, in_columns, shows_view_of
 from ..pose.pnp import gate_failure
 from ..rejection import Advice, Hint, Rejection, RejectionReason
-from ..structure.model import PointMatches, Structure
 
 MIN_SHARE, MIN_INLIERS = 0.1, 6
 """Inliers of a reference that a pose rests on: as a share of those of the reference with the most, and in all."""
@@ -137,10 +136,9 @@ def unmoved_failure(
     """
     query, estimate = support.query, support.estimate
     assert estimate is not None
-    given = query, support.references, support.structure, support.matches, support.query_matches
     said = None
     for knows_same_view in (False, True):  # the comparison of whole photographs is seldom needed
-        moved = moved_matches(*given, options, knows_same_view)
+        moved = moved_matches(support, support.query_matches, options, knows_same_view)
         unmoved_count = int((estimate.inliers & ~moved).sum())
         if not unmoved_count:
             return None
@@ -160,25 +158,17 @@ def without(unmoved_count: int) -> str:
 
 
 def moved_matches(
-    query: View,
-    references: Sequence[PosedView],
-    structure: Structure,
-    matches: PointMatches,
-    query_matches: Sequence[Matches],
-    options: StationaryOptions,
-    knows_same_view: bool = True,
+    support: Support, query_matches: Sequence[Matches], options: StationaryOptions, knows_same_view: bool = True
 ) -> NDArray[np.bool_]:
     """Returns which 2D-3D matches (M,) are evidence: their points are at other pixels in some reference.
 
     Args:
-        query: the photograph.
-        references: in the order that the structure's tracks number them.
-        structure: the points.
-        matches: of the photograph with the points.
+        support: the photograph, its references and its matches with points.
         query_matches: of the photograph with each reference; they say whether both show the same view.
         options: largest displacement of what is fixed.
         knows_same_view: whether matches at the same pixels as in a reference count if both show the same view.
     """
+    query, references, structure, matches = support.query, support.references, support.structure, support.matches
     keypoint_of = np.full(len(structure.x_in_world), -1)
     keypoint_of[matches.point] = matches.keypoint
     keypoint = keypoint_of[structure.tracks.point]

@@ -122,7 +122,7 @@ def without_unmoved(
     estimate, lines, query, references = support.estimate, support.two_view, support.query, support.references
     if lines is None:
         raise ValueError("support.two_view must not be None")
-    points = moved_matches(query, references, support.structure, support.matches, query_matches, options)
+    points = moved_matches(support, query_matches, options)
     rows = np.ones(len(lines.reference), bool)
     for i, reference in enumerate(references):
         own = np.flatnonzero(lines.reference == i)
