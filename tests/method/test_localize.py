@@ -141,8 +141,7 @@ def test_radii_contain_the_distance_of_halves() -> None:
         assert isinstance(support, PosedSupport)
         assert support.estimate.intrinsics is not None
         assert found.covariance is not None
-        votes = votes_of(support, support.query_matches)
-        apart_m = evidence_of(support, votes, support.query_matches).disagreement * support.distance_m()
+        apart_m = evidence_of(support, votes_of(support)).disagreement * support.distance_m()
         given, shared = support.estimate.covariance, support.estimate.intrinsics.pose_covariance
         halves = (apart_m / 2 / accuracy_from_covariance(given).position_68_m) ** 2
         assert halves > 0.001

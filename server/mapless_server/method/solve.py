@@ -122,12 +122,12 @@ def _gated(support: PosedSupport, coarse: Coarse, log10_chance: float) -> str | 
 def _judged(support: PosedSupport, coarse: Coarse, chance: float, agreement: float) -> Answer:
     """Accepts a pose or rejects it; `agreement` with directions counts if its evidence does not suffice otherwise."""
     prepared, options = coarse.prepared, coarse.prepared.pipeline.options.judge
-    given = support.query_matches, prepared.options.coverage, options
+    coverage, unit = prepared.options.coverage, prepared.unit
     with prepared.context.stage("judge"):
-        judged = judge(support, *given, chance, prepared.unit)
+        judged = judge(support, coverage, options, chance, unit)
         is_gated = judged.rejection is not None and judged.rejection.reason is RejectionReason.GATE
         if is_gated and agreement != chance:
-            judged = judge(support, *given, agreement, prepared.unit)
+            judged = judge(support, coverage, options, agreement, unit)
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
     estimate = with_halves(support.estimate, judged.evidence.disagreement * support.distance_m())
@@ -162,16 +162,13 @@ def _from_lines(coarse: Coarse) -> Answer:
     A pose that its evidence does not accept is no hypothesis: its matches agree with many others, too.
     """
     prepared, options = coarse.prepared, coarse.prepared.pipeline.options
-    query_matches = prepared.correspondences.query_matches
     support = _two_view_support(coarse)
     if support is None:
         return coarse.answer(Rejection(RejectionReason.TOO_FEW_MATCHES, "no pose fits the epipolar lines of matches"))
     with prepared.context.stage("judge"):
-        moved = without_unmoved(support, query_matches, prepared.pipeline.matcher.stationary)
-        evidence = two_view_evidence(moved, query_matches)
+        evidence = two_view_evidence(without_unmoved(support, prepared.pipeline.matcher.stationary))
         doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
-        votes = votes_of(support, query_matches)
-        rejection = None if doubt else contradiction(support, votes, options.judge, unit=prepared.unit)
+        rejection = None if doubt else contradiction(support, votes_of(support), options.judge, unit=prepared.unit)
     if rejection:
         return coarse.answer(rejection, support)
     if doubt and lacks_distance(evidence):

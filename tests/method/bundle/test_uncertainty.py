@@ -98,9 +98,9 @@ def adjusted_poses(
         adjusted = adjust_pose(
             AdjustInput(scene.query, noisy, structure, matches, AdjustOptions(uncertainty=options)), estimate
         )
-        support = Support(scene.query, noisy, structure, matches, np.zeros(3)).posed(adjusted)
         query_matches = true_correspondences(scene).query_matches
-        halves = evidence_of(support, votes_of(support, query_matches), query_matches)
+        support = Support(scene.query, noisy, structure, matches, np.zeros(3), query_matches).posed(adjusted)
+        halves = evidence_of(support, votes_of(support))
         covered = with_halves(adjusted, halves.disagreement * support.distance_m())
         errors.append(error(adjusted.world_from_camera, scene.world_from_query))
         covariances.append((adjusted.covariance, covered.covariance))

@@ -53,11 +53,11 @@ def support_of(outlier_share: float = 0.0, seen_share: float = 0.9) -> PosedSupp
 
 
 def verdict(support: PosedSupport, coverage: float, options: JudgeOptions = OPTIONS) -> tuple[float, Rejection | None]:
-    judged = judge(support, query_matches_of(support), coverage, options)
+    judged = judge(replace(support, query_matches=query_matches_of(support)), coverage, options)
     return judged.trust, judged.rejection
 
 
-def query_matches_of(support: PosedSupport) -> list[Matches]:
+def query_matches_of(support: PosedSupport) -> tuple[Matches, ...]:
     """The matches with each reference that the support's matches come from."""
     tracks, matches = support.structure.tracks, support.matches
     keypoint_of = np.full(len(support.structure.x_in_world), -1)
@@ -67,7 +67,7 @@ def query_matches_of(support: PosedSupport) -> list[Matches]:
         rows = (tracks.view == view) & (keypoint_of[tracks.point] >= 0)
         pairs = np.stack([keypoint_of[tracks.point[rows]], tracks.keypoint[rows]], axis=1)
         of_references.append(pairs.astype(np.int32))
-    return of_references
+    return tuple(of_references)
 
 
 def test_trust_is_high_with_good_support_and_low_without() -> None:
@@ -86,8 +86,9 @@ def test_poses_from_degenerate_points_are_rejected(shape: str, count: int) -> No
         if isinstance(estimate, Rejection):
             continue
         reference = PosedView("key", "scenes/s/references/r", query, POSE)
-        support = Support(query, (reference,), structure, matches, np.zeros(3)).posed(estimate)
-        rejection = judge(support, [np.empty((0, 2), np.int32)], COVERAGE, OPTIONS).rejection
+        none = (np.empty((0, 2), np.int32),)
+        support = Support(query, (reference,), structure, matches, np.zeros(3), none).posed(estimate)
+        rejection = judge(support, COVERAGE, OPTIONS).rejection
         assert rejection is not None
 
 
@@ -141,8 +142,8 @@ def test_worse_matches_and_fewer_points_lower_the_trust() -> None:
 
 
 def evidence(support: PosedSupport) -> Evidence:
-    matches = query_matches_of(support)
-    return evidence_of(support, votes_of(support, matches), matches)
+    matched = replace(support, query_matches=query_matches_of(support))
+    return evidence_of(matched, votes_of(matched))
 
 
 def test_expected_share_is_the_median_of_each_references_own() -> None:
@@ -258,7 +259,7 @@ def solved(scene: SyntheticScene) -> PosedSupport:
 
 
 def both(scene: SyntheticScene, support: PosedSupport) -> tuple[float, float]:
-    votes = votes_of(support, true_correspondences(scene).query_matches)
+    votes = votes_of(replace(support, query_matches=true_correspondences(scene).query_matches))
     return (
         disagreement_of_matches(support, DISTANCE_M),
         disagreement_of_references(support, votes, DISTANCE_M),
@@ -331,7 +332,7 @@ def test_halves_of_references_with_wrong_poses_disagree() -> None:
     """Points seen by references of one half are where those references were moved to."""
     scene = scene_of("moved")
     support = solved(scene)
-    votes = votes_of(support, true_correspondences(scene).query_matches)
+    votes = votes_of(replace(support, query_matches=true_correspondences(scene).query_matches))
     shift = np.array([1.0, 0.0, 0.0])
     shifted = votes.seen.x_in_world + np.where((votes.reference % 2 == 0)[:, None], shift, 0.0)
     moved = replace(votes, seen=replace(votes.seen, x_in_world=shifted))

@@ -95,7 +95,7 @@ def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
     plain = first.unit_descriptors() @ second.unit_descriptors().T
     for either in (False, True):
         matches = mutual_matches(first, second, 0.99, either, matching.Arithmetic.INT8)
-        assert matches.tolist() == best_of_both(plain.copy(), 0.99, either=either).tolist()
+        assert matches.tolist() == best_of_both(plain.copy(), (0.99,), either=either)[0].tolist()
 
 
 def test_ambiguous_descriptors_are_not_matched() -> None:

@@ -57,7 +57,7 @@ class Planted:
         return solve_two_view(self.query, self.references, matched, ORIGIN, TwoViewOptions(), intrinsics)
 
     def evidence(self, support: PosedSupport) -> TwoViewEvidence:
-        return two_view_evidence(support, self.correspondences.query_matches)
+        return two_view_evidence(support)
 
 
 class Given(Matcher):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import NO_PRIORS, Priors
-from ..features.views import PosedView, ReconstructedView, Reconstruction, View
+from ..features.views import PosedView, ReconstructedView, Reconstruction, View, map_cells
 from ..pairs.correspond import Correspondences
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, MIN_MATCHES, PnpOptions, format_false_alarms, log10_false_alarms, ransac
 from ..pose.with_priors import informed_pose
@@ -161,7 +161,7 @@ def _map(
         local_from_world.transform_pose(world_from_camera),
     )
     pixels = view.features.pixels(keypoints)
-    rows, columns, inside = maps.cells(pixels, view.camera)
+    rows, columns, inside = map_cells(maps.camera, pixels, view.camera)
     x_in_camera = world_from_camera.inverse().apply(points[inside])
     maps.point_map[rows[inside], columns[inside]] = local_from_world.scale * x_in_camera
     maps.confidence[rows[inside], columns[inside]] = 1.0

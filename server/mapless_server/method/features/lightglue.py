@@ -26,35 +26,30 @@ class LightGlueOptions:
             return these first). The time is quadratic in it.
         pairs_at_once: batch size; all pairs of a query on a GPU. A CPU does not gain from batches.
         half: compute in float16, as the authors do on a GPU.
-        depth_confidence, width_confidence: see `LightGlue.match_one`, which matches if batches are of one pair; the
-            authors' values. In the kitchen they find 97 % of the matches in half the time.
     """
 
     min_score: float = 0.1
     max_keypoints: int = 2048
     pairs_at_once: int = 32
     half: bool = False
-    depth_confidence: float = 0.95
-    width_confidence: float = 0.99
 
     def __post_init__(self) -> None:
         check_bounds(self, "min_score", at_least=0, below=1)
         check_bounds(self, "max_keypoints pairs_at_once", at_least=1)
-        check_bounds(self, "depth_confidence width_confidence", at_least=0, at_most=1)
 
+
+CONFIDENCES = 0.95, 0.99
+"""The authors' depth and width confidence, see `LightGlue.match_one`: 97 % of the matches in half the time."""
 
 CPU_OPTIONS = LightGlueOptions(max_keypoints=1024, pairs_at_once=1)
 CUDA_OPTIONS = LightGlueOptions(half=True)
 
 
 class LightGlueMatching:
-    """Matches photographs by LightGlue, see correspond.QueryMatching and correspond.PairMatching.
+    """Matches photographs by LightGlue, see `QueryMatching` and `PairMatching`.
 
-    Args:
-        network: the network, with its weights.
-        device: "cpu" or a CUDA device.
-        options: None takes those for the device.
-        sha256: hash of the weights, a part of the name.
+    The device is "cpu" or a CUDA device, by which options are chosen if None are given; the weights' hash is a part of
+    the name.
     """
 
     def __init__(
@@ -62,10 +57,8 @@ class LightGlueMatching:
     ) -> None:
         self._device = torch.device(device)
         self.options = options or (CUDA_OPTIONS if self._device.type == "cuda" else CPU_OPTIONS)
-        it = self.options
-        self.name = (
-            f"lightglue-{sha256[:8]}-{it.min_score}-{it.max_keypoints}-{it.depth_confidence}-{it.width_confidence}"
-        )
+        numbers = self.options.min_score, self.options.max_keypoints, *CONFIDENCES
+        self.name = "-".join(["lightglue", sha256[:8], *map(str, numbers)])
         self._network = network.to(self._device).eval()
 
     def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
@@ -85,8 +78,7 @@ class LightGlueMatching:
         if not len(first.features) or not len(second.features):
             return NOTHING
         with torch.autocast(self._device.type, torch.float16, enabled=self.options.half):
-            confidences = self.options.depth_confidence, self.options.width_confidence
-            found = self._network.match_one(self._inputs(first), self._inputs(second), *confidences, pause)
+            found = self._network.match_one(self._inputs(first), self._inputs(second), *CONFIDENCES, pause)
         index, score = (it.cpu().numpy() for it in found)
         return self._probable(index, score)
 

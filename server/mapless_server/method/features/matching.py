@@ -43,10 +43,7 @@ def mutual_matches(
     either: bool = False,
     arithmetic: Arithmetic = Arithmetic.FLOAT32,
 ) -> Matches:
-    """Mutual nearest neighbours that pass the ratio test from first to second or, if `either`, from second to first.
-
-    Descriptors have unit length, so with cosine s the distance is sqrt(2 - 2 s).
-    """
+    """Mutual nearest neighbours that pass the ratio test from first to second or, if `either`, from second to first."""
     if either:
         return mutual_matches_of_ratios(first, second, (ratio,), arithmetic)[0]
     if len(first) < 2 or len(second) < 2:
@@ -74,7 +71,7 @@ def mutual_matches_of_ratios(
         return [np.empty((0, 2), np.int32) for _ in ratios]
     similarity = np.empty((len(first), len(second)), np.float32)
     deque(cosine_blocks(first, second, arithmetic, similarity), 0)
-    return _best_of_both(similarity, ratios, either=True)
+    return best_of_both(similarity, ratios, either=True)
 
 
 def cosine_blocks(
@@ -132,18 +129,13 @@ def has_exact_products() -> bool:
 
 
 def best_of_both(
-    similarity: NDArray[np.float32], ratio: float, smallest: float = -1.0, either: bool = False
-) -> Matches:
-    """Entries of a matrix of cosines (N, M) that are mutual maxima, above `smallest`, and pass the ratio test by row.
-
-    If `either`, it suffices to pass the ratio test by column. Overwrites the matrix.
-    """
-    return _best_of_both(similarity, (ratio,), smallest, either)[0]
-
-
-def _best_of_both(
     similarity: NDArray[np.float32], ratios: Sequence[float], smallest: float = -1.0, either: bool = False
 ) -> list[Matches]:
+    """For each ratio, entries of a matrix of cosines (N, M) that are mutual maxima and pass the ratio test by row.
+
+    All are above `smallest`. If `either`, it suffices to pass the ratio test by column. Overwrites the matrix. With a
+    cosine s the distance of descriptors is sqrt(2 - 2 s).
+    """
     if not similarity.size:
         return [np.empty((0, 2), np.int32) for _ in ratios]
     rows = np.arange(len(similarity))
@@ -179,15 +171,12 @@ class CorrespondOptions:
         wide_similarity: smallest cosine of descriptors of a match along the line, for the same reason.
         guided_similarity: smallest cosine of descriptors of a match that is searched near a point's projection.
         sampled_share: one in so many of the query's keypoints is matched with all references among which those of a
-            query are chosen. With a sixth the chosen have 0.97 to 1.00 of the matches that those chosen by all
-            keypoints have, with an eighth 0.97 to 0.99 (kitchen, drive, office, lockers).
+            query are chosen.
         enough_sampled: if the chosen have fewer matches of sampled keypoints each, on average, they are chosen again by
-            all: in `office-lockers`, where SIFT has 23, the order of the references is partly noise.
+            all.
         rematched_references: so many references of a query, those with the most matches, are matched again by a
             `PairMatching`, if there is one.
-        enough_matches: pairs of references for which nearest neighbours find so many are not matched by it: from about
-            250 on LightGlue finds fewer, of fewer keypoints. In the kitchen with 3 references (433, 267 and 179
-            matches) 300 instead of 500 costs one of 40 photographs; in meeting-room with 5 (141 at most) 50 costs none.
+        enough_matches: pairs of references for which nearest neighbours find so many are not matched by it.
         remembered_pairs: number of cached pairs of references, about 8 KiB each.
         structure_bytes: memory of the cached structures of sets of references, about 0.25 MB for ten at 640x480.
     """
@@ -234,14 +223,10 @@ OPTIONS: Mapping[str, CorrespondOptions] = {
     # Not measured, for lack of the weights. The cosine is that of a distance of 0.7, which is usual.
     "superpoint": replace(_ALIKED, query_ratio=0.9, wide_similarity=0.755, guided_similarity=0.755),
 }
-"""For each extractor that a setting can name.
+"""For each extractor that a setting can name; EdgePoint2's were measured with L64.
 
-Distances of learned descriptors differ less: at ALIKED's ratio of 0.95 a pair of kitchen photographs has 243 true
-matches and 36 false ones, at 0.85 only 119 and 2, where SIFT has 125 and 56. Between references the ratio test would
-cost a third of the true matches without benefit, because the epipolar constraint removes nearly all false ones.
-
-EdgePoint2's were measured with L64. A ratio of 0.9 for the query, or a similarity of 0.8, helps in the kitchen (0.34 cm
-instead of 0.41 from 5 references) and costs as much on the drive; both let a wrong pose pass in `office-lockers`.
+Distances of learned descriptors differ less, so their ratios are larger. Between references they need no ratio test:
+the epipolar constraint removes nearly all false matches.
 """
 
 
@@ -298,10 +283,7 @@ class StoredPairs(Protocol):
 
 
 class SharedThreads:
-    """Helps queries to match: each computes in its own thread, and threads that are free take over a part.
-
-    So a query alone uses all cores, and as many queries as there are cores use a thread each.
-    """
+    """Helps queries to match: each computes in its own thread, and threads that are free take over a part."""
 
     def __init__(self, threads: int) -> None:
         """Uses so many threads for one query, its own among them."""

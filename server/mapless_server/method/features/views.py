@@ -24,11 +24,6 @@ Ignored = NDArray[np.bool_]
 """(H, W): pixels of an image that show nothing of the place, by the mask that was given with it."""
 
 
-def nothing_ignored() -> Ignored | None:
-    """`Photograph.read_ignored` of a photograph without a mask."""
-    return None
-
-
 @dataclass(frozen=True, eq=False)
 class Features:
     """Local features of one photograph.
@@ -111,7 +106,7 @@ class Photograph:
     identify: Callable[[], str]
     camera: Camera
     read: Callable[[], NDArray[np.uint8]]
-    read_ignored: Callable[[], Ignored | None] = nothing_ignored
+    read_ignored: Callable[[], Ignored | None] = lambda: None
 
     @cached_property
     def sha256(self) -> str:
@@ -142,23 +137,15 @@ class View:
     photograph: Photograph | None = None
     distortion: Distortion | None = None
 
-    @cached_property
-    def _cells(self) -> dict[int, NDArray[np.int32]]:
-        return {}
-
     def cells(self, columns: int) -> NDArray[np.int32]:
         """Indices (N,) of the keypoints' cells, row by row, in a grid of so many columns; see `grid_shape`.
 
-        Those of keypoints outside, which lenses have, are the nearest ones. They are computed once: references stay in
-        memory for many queries.
+        Those of keypoints outside, which lenses have, are the nearest ones.
         """
-        found = self._cells.get(columns)
-        if found is None:
-            rows, _ = grid_shape(self.camera, columns)
-            at = ((self.features.keypoints + 0.5) * (columns / self.camera.width_px)).astype(np.int32)
-            column, row = at[:, 0].clip(0, columns - 1), at[:, 1].clip(0, rows - 1)
-            found = self._cells[columns] = np.asarray(row * columns + column, np.int32)
-        return found
+        rows, _ = grid_shape(self.camera, columns)
+        at = ((self.features.keypoints + 0.5) * (columns / self.camera.width_px)).astype(np.int32)
+        column, row = at[:, 0].clip(0, columns - 1), at[:, 1].clip(0, rows - 1)
+        return np.asarray(row * columns + column, np.int32)
 
     def has_camera_of(self, other: "View") -> bool:
         """Whether both have the same intrinsics, to a thousandth of the width, and so the same errors of them.
@@ -262,16 +249,10 @@ class ReconstructedView:
 
     def depth_at(self, pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:
         """Depth (N,) at pixels (N, 2) of the view's camera, nearest neighbour; NaN where unknown."""
-        rows, columns, inside = self.cells(pixels, camera)
+        rows, columns, inside = map_cells(self.camera, pixels, camera)
         depth = np.full(len(pixels), np.nan)
         depth[inside] = self.point_map[rows[inside], columns[inside], 2]
         return depth
-
-    def cells(
-        self, pixels: NDArray[np.floating], camera: Camera
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
-        """Rows and columns (N,) of the maps' cells at pixels (N, 2) of the view's camera, and which are inside."""
-        return map_cells(self.camera, pixels, camera)
 
 
 def map_cells(
@@ -388,9 +369,6 @@ def view_of(
     """
     is_exact = descriptors.dtype in (np.uint8, np.int8)
     rounded = descriptors if is_exact else rounded_descriptors(np.asarray(descriptors, np.float32))
-    if not len(pixels):
-        nothing = Features(np.empty((0, 2), np.float32), rounded, sizes_px)
-        return View(camera.pinhole(), nothing, distortion=camera.distortion)
     ideal = undistort_pixels(pixels, camera)
     usable = np.isfinite(ideal).all(axis=1)
     features = Features(ideal[usable].astype(np.float32), rounded[usable], sizes_px[usable])

@@ -116,8 +116,7 @@ class PosedImage:
 
     def moved(self) -> PosedImage:
         """Without matches at the same pixels as in the references, see `judge.references`."""
-        support = replace(self.source, matches=self.matches)
-        kept = moved_matches(support, support.query_matches, StationaryOptions())
+        kept = moved_matches(replace(self.source, matches=self.matches), StationaryOptions())
         return replace(
             self, matches=self.matches.select(kept), inliers=self.inliers[kept], errors_px=self.errors_px[kept]
         )

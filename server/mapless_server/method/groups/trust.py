@@ -94,7 +94,7 @@ def _references_apart(matched: Sequence[PosedImage], distance_m: float) -> float
     names: dict[str, int] = {}
     for it, mounting in zip(matched, _mounting(matched), strict=True):
         source = it.source
-        votes = votes_of(source, source.query_matches)
+        votes = votes_of(source)
         number = np.array([names.setdefault(r.key, len(names)) for r in source.references], np.intp)
         cameras.append(CameraMatches(votes.seen, mounting))
         owners.append(number[votes.reference])

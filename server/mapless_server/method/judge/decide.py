@@ -201,7 +201,7 @@ class _Scored:
     def of(cls, support: Support, is_used: NDArray[np.bool_]) -> "_Scored":
         """The matches of a support with these of its references (K,)."""
         lines = TwoViewMatches.of(support.query, support.references, support.query_matches)
-        votes, none = votes_of(support, support.query_matches), np.empty(0, np.intp)
+        votes, none = votes_of(support), np.empty(0, np.intp)
         used = lines[is_used[lines.reference]]
         evidence = relative.Evidence(support.query, support.references, used, np.empty((0, 3)), none)
         return cls(evidence, votes[is_used[votes.reference]], support.origin)

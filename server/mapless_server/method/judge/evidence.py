@@ -1,13 +1,12 @@
 """Evidence for a pose: quantities that mean the same for every scene, unit and kind of feature.
 
 One is how far apart the poses are that disjoint halves of the data give. A pose that is right and well determined is
-found again from half of the matches, and from the matches with half of the references. A wrong one is not: chance and
-repeated structure put the halves at different places, wrong reference poses put the halves of the references there, and
-a pose that few matches or a flat scene determine badly moves by as much as its own error. Matches from a guided search
-agree with the pose around which they were searched, so they take no part unless there are no others.
+found again from half of the matches, and from the matches with half of the references; chance, repeated structure and
+wrong reference poses put the halves at different places. Matches from a guided search agree with the pose around which
+they were searched, so they take no part unless there are no others.
 
-RANSAC finds the pose of a half, which knows nothing of the pose in question. But where most of a half agree with this,
-RANSAC could not find another one that more of them agree with, only the same a little moved, so that is computed.
+RANSAC finds the pose of a half, unless most of a half agree with the pose in question: RANSAC would find the same a
+little moved, so that is computed.
 """
 
 import math
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import PosedSupport, Support
+from ..features.tracks import keypoint_offsets
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import cauchy_weight, pose_jacobian
 from ..pose.pnp import LOSS_SCALE_PX, PnpOptions, ransac
@@ -32,7 +32,7 @@ MOST_POINTS = 2000
 """The shares that references find are computed from so many points, evenly thinned."""
 
 LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
-"""Below these evidence is not better or worse. A right pose's halves are apart by a thousandth of the distance."""
+"""Below these evidence is not better or worse."""
 
 MAJORITY, LEAST_AGREEING = 0.5, 8
 """Where a larger share of a half's matches agree with the pose, and so many, the half's own pose is near it."""
@@ -55,8 +55,7 @@ SHUFFLING = 0.3
 random, so that the splits differ and the halves remain balanced."""
 
 PNP = PnpOptions(min_iterations=30, max_iterations=1000, max_matches=600)
-"""Of the halves' poses. With good matches, 30 iterations give the same poses as 100; 1000 find a pose with a third of
-the matches as inliers."""
+"""RANSAC of the halves' poses; 1000 iterations find a pose with a third of the matches as inliers."""
 
 NO_AGREEMENT = 1.0
 """The disagreement of halves that give no pose: as far apart as what they see is away."""
@@ -84,11 +83,10 @@ class Votes:
         return int(np.count_nonzero(np.bincount(self.keypoint[rows])))
 
 
-def votes_of(support: Support, query_matches: Sequence[Matches]) -> Votes:
+def votes_of(support: Support) -> Votes:
     """The matches of a support's query with keypoints of triangulated points."""
-    query, references, structure = support.query, support.references, support.structure
-    tracks = structure.tracks
-    offsets = np.concatenate([[0], np.cumsum([len(r.view.features) for r in references])])
+    query, structure, query_matches = support.query, support.structure, support.query_matches
+    tracks, offsets = structure.tracks, keypoint_offsets(support.references)
     point_of = np.full(offsets[-1], -1)
     point_of[offsets[tracks.view] + tracks.keypoint] = tracks.point
     reference = np.repeat(np.arange(len(query_matches)), [len(m) for m in query_matches])
@@ -107,7 +105,7 @@ def disagreement_of_matches(support: PosedSupport, distance_m: float) -> float:
     def random_half(random: np.random.Generator) -> NDArray[np.bool_]:
         return np.asarray(random.permutation(len(seen)) % 2 == 0)
 
-    return _median_disagreement(seen, random_half, distance_m, _pose(support))
+    return _median_disagreement(seen, random_half, distance_m, support.estimate.world_from_camera)
 
 
 def disagreement_of_references(support: PosedSupport, votes: Votes, distance_m: float) -> float:
@@ -120,7 +118,8 @@ def disagreement_of_references(support: PosedSupport, votes: Votes, distance_m: 
     def half_of_votes(random: np.random.Generator) -> NDArray[np.bool_]:
         return np.asarray(half_of_references(counts, random)[votes.reference])
 
-    return _median_disagreement(votes.seen, half_of_votes, distance_m, _pose(support), votes.keypoint)
+    pose = support.estimate.world_from_camera
+    return _median_disagreement(votes.seen, half_of_votes, distance_m, pose, votes.keypoint)
 
 
 def half_of_references(counts: NDArray[np.intp], random: np.random.Generator) -> NDArray[np.bool_]:
@@ -131,10 +130,6 @@ def half_of_references(counts: NDArray[np.intp], random: np.random.Generator) ->
         in_first[reference] = totals[0] <= totals[1]
         totals[0 if in_first[reference] else 1] += counts[reference]
     return in_first
-
-
-def _pose(support: PosedSupport) -> RigidTransform:
-    return support.estimate.world_from_camera
 
 
 def _median_disagreement(
@@ -220,8 +215,7 @@ class Evidence:
         match_count: number of 2D-3D matches.
         found_share: share of inliers among the points that project into the image, or among the photograph's features
             if they are fewer.
-        expected_share: median of the same share over the references: in the dark, between distant references, or where
-            much is hidden, a reference, too, observes few of the points that it should see.
+        expected_share: median of the same share over the references, which is small, too, where much is hidden or dark.
         hull_share: share of the image covered by the convex hull of the inliers.
         epipolar_share: share of the matches with a reference that lie on their epipolar lines, for the two references
             with the most inliers, multiplied. Most of these matches have no point, so they took no part in the pose.
@@ -251,30 +245,21 @@ class Evidence:
 
     @property
     def score(self) -> float:
-        """ln(found ratio x hull share x epipolar share / disagreement); larger for better evidence.
-
-        Fitted weights of the logarithms were alike, so they have none.
-        """
+        """ln(found ratio x hull share x epipolar share / disagreement); larger for better evidence."""
         found, hull = max(LEAST_SHARE, self.found_ratio), max(LEAST_HULL_SHARE, self.hull_share)
         epipolar = max(LEAST_EPIPOLAR_SHARE, self.epipolar_share)
         return math.log(found * hull * epipolar / max(LEAST_DISAGREEMENT, self.disagreement))
 
 
-def evidence_of(support: PosedSupport, votes: Votes, query_matches: Sequence[Matches]) -> Evidence:
-    """Computes the evidence for the estimate of a support.
+def evidence_of(support: PosedSupport, votes: Votes) -> Evidence:
+    """Computes the evidence for the estimate of a support, and its matches carried to points.
 
-    Args:
-        support: the support, whose estimate has at least four inliers.
-        votes: the query's matches, carried to points.
-        query_matches: matches of the query with each reference.
-
-    Raises:
-        ValueError: there is no such estimate.
+    ValueError if the estimate has fewer than four inliers.
     """
-    estimate, query, structure, matches = support.estimate, support.query, support.structure, support.matches
-    if estimate.inliers.sum() < 4:
+    query, structure, matches = support.query, support.structure, support.matches
+    inliers, pose = support.estimate.inliers, support.estimate.world_from_camera
+    if inliers.sum() < 4:
         raise ValueError("support.estimate must have at least 4 inliers")
-    inliers, pose = estimate.inliers, estimate.world_from_camera
     distance_m = support.distance_m()
     return Evidence(
         int(inliers.sum()),
@@ -282,7 +267,7 @@ def evidence_of(support: PosedSupport, votes: Votes, query_matches: Sequence[Mat
         min(1.0, float(inliers.sum() / max(1, findable_count(query, structure.x_in_world, pose)))),
         expected_share(structure, support.references),
         hull_share(query, matches, inliers),
-        epipolar_share(query, support.references, query_matches, support.inliers_by_reference(), pose),
+        epipolar_share(query, support.references, support.query_matches, support.inliers_by_reference(), pose),
         disagreement_of_matches(support, distance_m),
         disagreement_of_references(support, votes, distance_m),
     )

@@ -4,22 +4,17 @@ The evidence for a pose gives a score, the larger the better. The *trust* of an 
 photographs of difficult places, with known poses, whose score is at most as high. So accepting poses with a trust of at
 least 1 - c accepts the share c of right answers, independent of the scale of the score: trust is the p-value of "this
 is a right answer", as in conformal prediction (Vovk, Gammerman and Shafer 2005). It is not the probability of being
-right, which depends on how many of a caller's photographs show the place at all.
+right, which depends on how many of a caller's photographs show the place at all. Wrong intrinsics are checked
+separately (`cameras`), because the evidence of their answers is as good as that of right ones.
 
-Wrong intrinsics are checked separately (`intrinsics`), because the evidence of their answers is as good as that of
-right ones.
+The quantiles were measured on the third of twelve places where right answers have the least evidence, so that the
+coverage holds in a place like these. A right answer is off by at most 5 % of the distance to what the photograph shows,
+5 degrees and, in scenes in metres, 25 cm.
 
-The quantiles were measured once (server/research): answers to photographs with many and few references, of the third of
-twelve places where right answers have the least evidence, so that the coverage holds in a place like these; elsewhere
-more are accepted. A right answer is off by at most 5 % of the distance to what the photograph shows, 5 degrees and, in
-scenes in metres, 25 cm.
+A pose is ambiguous if it has a rival: with repeated structure, or some references with wrong poses, the matches of the
+references form two clusters. A second pose, among the matches that are outliers of the first, is a rival if
 
-A second pose, at another place, that other references support about as well, makes a pose ambiguous. With repeated
-corridors and floors, identical furniture, or some references with wrong poses, the matches of the references form two
-clusters, and the pose with a few more inliers is found. So a second pose is searched among the matches that are
-outliers of the first. It is a rival if
-
-    its inliers are not chance (the a-contrario test of `gate`, over these matches),
+    its inliers are not chance (the a-contrario test of `pnp`, over these matches),
     it explains at least a given share of the number of keypoints that the first pose explains,
     it is further from the first pose than the 95 % radii of both, and
     most of its inliers come from references that support it more than the first pose.
@@ -41,7 +36,6 @@ from mapless_server.bounds import check_bounds
 
 from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance
 from ..bundle.intrinsics import ContradictionOptions
-from ..features.views import Matches
 from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.pnp import PnpOptions, disc_chance, false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
@@ -50,15 +44,13 @@ from .evidence import Evidence, Votes, evidence_of, votes_of
 from .references import disagreeing_references, supporters_of
 
 RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10
-"""Least number of keypoints of a rival, as a share of those of the first pose, and in all. A place with less than half
-the keypoints of another is distinguished from it."""
+"""Least number of keypoints of a rival, as a share of those of the first pose, and in all."""
 
 RIVAL_MAX_LOG10_FALSE_ALARMS = -6.0
-"""As in `gate`, but stricter, because a rival is searched for every answer."""
+"""As `pnp.MAX_LOG10_FALSE_ALARMS`, but stricter, because a rival is searched for every answer."""
 
 RIVAL_MIN_OWN_SHARE = 0.5
-"""Least share of a rival's inliers from references that support it more than the first pose. A few references that show
-both places support both."""
+"""Least share of a rival's inliers from references that support it more than the first pose."""
 
 MIN_APART_M, MIN_APART_DEG = 0.1, 5.0
 """Poses nearer than this are one place, independent of their radii."""
@@ -68,7 +60,7 @@ AGREEING_PX = 12.0
 not a second place."""
 
 RIVAL_PNP = PnpOptions(min_iterations=50, max_iterations=200, max_matches=300)
-"""Of the rival's pose. The few iterations find a pose with a third of the matches as inliers."""
+"""RANSAC of the rival's pose; the few iterations find a pose with a third of the matches as inliers."""
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -82,12 +74,10 @@ class JudgeOptions:
     Attributes:
         scores: quantiles of the scores of right answers at `LEVELS`.
         agreement_weight: weight of ln(1 / chance) if gravity or heading agrees with a pose. It would be 1 if poses were
-            wrong only by chance; but poses from repeated structure and wrong references agree too, and so do slightly
-            wrong ones.
+            wrong only by chance; but slightly wrong ones, and those from repeated structure, agree, too.
         intrinsics: options of the check of the photograph's intrinsics.
         max_radius_share: largest 68 % radius of the position, as a share of the distance to what the photograph shows:
-            of the poses with a larger one too many are wrong. Of 2,416 right answers 7 have it, of 116 wrong ones 18.
-            Each of twelve places left out, the others choose this limit.
+            of the poses with a larger one too many are wrong.
     """
 
     scores: tuple[float, ...] = (
@@ -127,31 +117,24 @@ class Judgement:
 
 
 def judge(
-    support: PosedSupport,
-    query_matches: Sequence[Matches],
-    coverage: float,
-    options: JudgeOptions,
-    log10_chance: float = 0.0,
-    unit: str = "m",
+    support: PosedSupport, coverage: float, options: JudgeOptions, log10_chance: float = 0.0, unit: str = "m"
 ) -> Judgement:
-    """Judges the estimate of a support.
+    """Judges the estimate of a support, which has passed the gate.
 
     Args:
-        support: the support, whose estimate has passed the gate.
-        query_matches: matches of the query with each reference.
+        support: the support.
         coverage: share of right answers to accept, above 0 and at most 1.
         options: options of the judge.
         log10_chance: see `Priors.log10_chance`.
         unit: the scene's unit of length, in messages.
 
     Returns:
-        The judgement. Its rejection, in the support's world, is GATE, with a hint, if the photograph contradicts its
-        intrinsics; AMBIGUOUS with both hypotheses if a second pose is supported about as well; GATE, with a hint, if
-        the position's radius is too large; and GATE if the trust is
-        less than 1 - coverage.
+        The judgement. Its rejection, in the support's world, is GATE, with a hint, if the references disagree, the
+        photograph contradicts its intrinsics or the position's radius is too large; AMBIGUOUS with both hypotheses if a
+        second pose is supported about as well; and GATE if the trust is less than 1 - coverage.
     """
-    votes = votes_of(support, query_matches)
-    evidence = evidence_of(support, votes, query_matches)
+    votes = votes_of(support)
+    evidence = evidence_of(support, votes)
     trust = trust_of(evidence, options, log10_chance)
     doubt = low_trust(evidence, trust, coverage)
     contradicted = contradiction(support, votes, options, is_doubted=doubt is not None, unit=unit)
@@ -242,13 +225,9 @@ def _ambiguous(hypotheses: tuple[PoseHypothesis, PoseHypothesis], unit: str) -> 
 
 
 def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, PoseHypothesis] | None:
-    """Finds the first pose and its rival, as hypotheses in the support's world; None without a rival.
+    """Finds a support's pose and its rival among the votes, as hypotheses in the support's world; None without a rival.
 
     Projects all matches, and searches only if enough of them are outliers.
-
-    Args:
-        support: the first pose's support, with its estimate.
-        votes: the query's matches with each reference.
     """
     estimate, camera = support.estimate, support.query.camera
     errors_px = votes.seen.errors_px(estimate.world_from_camera)

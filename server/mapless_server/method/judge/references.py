@@ -1,18 +1,14 @@
-"""Whether the references that a pose rests on agree with their own poses, by matches that these took no part in.
+"""What a pose rests on: references that agree with their own poses, and matches that are not fixed to the camera.
 
-It is evidence about the references, not about the pose: where they do not agree, no pose that rests on them is right,
-however many matches it explains.
+No pose is right that rests on references which do not agree with their own poses, however many matches it explains.
+Their agreement is known from matches that took no part in the pose.
 
-Matches that may be fixed to the camera are no evidence for a pose, also where references do not show it.
-
-Matches at the same pixels as in a reference say "the pose of the reference". On a straight drive poses explain them as
-points that are far away, and a single reference, or several at one pose, cannot show that they are anything else; but a
-badge, a display or a watermark makes them in photographs of any place. So they may take part in a pose, but the pose
-must be no chance without them. A photograph that shows the same as a reference from the same place matches it at the
-same pixels all over the image: then they are evidence.
+Matches at the same pixels as in a reference may be fixed to the camera: a badge, a display or a watermark makes them in
+photographs of any place. They may take part in a pose, but the pose must be no chance without them. They are evidence
+where they lie all over the image: the photograph shows the same as the reference, from the same place.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -21,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..bundle.estimate import PosedSupport, Support
 from ..features.tracks import keypoint_offsets
-from ..features.views import Matches, PosedView, ReferenceErrors, View
+from ..features.views import PosedView, ReferenceErrors, View
 from ..pairs.agreement import MAX_ERROR_PX
 from ..pairs.stationary import StationaryOptions, have_same_shape, in_columns, shows_view_of
 from ..pose.pnp import gate_failure
@@ -48,6 +44,16 @@ class Supporters:
     inlier_counts: Sequence[int]
     error_px: ReferenceErrors | None
 
+    def errors_px(self) -> list[float]:
+        """Errors of the pairs of those that a pose rests on most, as far as they are known."""
+        if self.error_px is None:
+            return []
+        least = max(MIN_INLIERS, MIN_SHARE * max(self.inlier_counts, default=0))
+        used = [i for i, count in enumerate(self.inlier_counts) if count >= least]
+        used = sorted(used, key=lambda i: -self.inlier_counts[i])[:MOST_REFERENCES]
+        found = (self.error_px(*sorted(pair)) for pair in combinations(used, 2))
+        return [it for it in found if it is not None]
+
 
 def supporters_of(support: PosedSupport) -> Supporters:
     """The references that support the estimate of a support."""
@@ -55,19 +61,9 @@ def supporters_of(support: PosedSupport) -> Supporters:
     return Supporters(names, support.inliers_by_reference(), support.reference_error_px)
 
 
-def disagreeing_references(photographs: Iterable[Supporters]) -> Rejection | None:
+def disagreeing_references(photographs: Sequence[Supporters]) -> Rejection | None:
     """Rejects a pose, of one photograph or of several together, whose supporting references mostly do not agree."""
-    errors_px: list[float] = []
-    best: tuple[int, str] = (0, "")
-    for photograph in photographs:
-        counts = photograph.inlier_counts
-        if photograph.error_px is None or not counts:
-            continue
-        used = _most_supporting(counts)
-        if used:
-            best = max(best, (counts[used[0]], photograph.names[used[0]]))
-        found = (photograph.error_px(*sorted(pair)) for pair in combinations(used, 2))
-        errors_px += [it for it in found if it is not None]
+    errors_px = [it for photograph in photographs for it in photograph.errors_px()]
     agreeing = sum(it <= MAX_ERROR_PX for it in errors_px)
     if not errors_px or 2 * agreeing >= len(errors_px):
         return None
@@ -76,15 +72,7 @@ def disagreeing_references(photographs: Iterable[Supporters]) -> Rejection | Non
         f"they show in common is {sorted(errors_px)[len(errors_px) // 2]:.0f} px off, in the median (of an image of "
         f"1024 pixels, at most {MAX_ERROR_PX:g})"
     )
-    return Rejection(
-        RejectionReason.GATE, message, Hint("judge", Advice.CHECK_REFERENCE_POSES, ADVICE, best[1] or None)
-    )
-
-
-def _most_supporting(counts: Sequence[int]) -> list[int]:
-    """Indices of the references that a pose rests on, at most `MOST_REFERENCES`, those with the most inliers first."""
-    least = max(MIN_INLIERS, MIN_SHARE * max(counts, default=0))
-    return sorted((i for i, count in enumerate(counts) if count >= least), key=lambda i: -counts[i])[:MOST_REFERENCES]
+    return _wrong_references(message, photographs)
 
 
 def without_agreement(photographs: Sequence[Supporters]) -> Rejection | None:
@@ -93,18 +81,16 @@ def without_agreement(photographs: Sequence[Supporters]) -> Rejection | None:
     The pose is that of one photograph, or of several together. Elsewhere references of which nothing is known are taken
     to have right poses.
     """
-    best: tuple[int, str] = (0, "")
-    for photograph in photographs:
-        counts, error_px = photograph.inlier_counts, photograph.error_px
-        used = _most_supporting(counts)
-        found = [] if error_px is None else [error_px(*sorted(pair)) for pair in combinations(used, 2)]
-        if any(it is not None and it <= MAX_ERROR_PX for it in found):
-            return None
-        best = max([best, *zip(counts, photograph.names, strict=True)])
-    message = "no two of the references that the pose rests on agree with their own poses"
-    return Rejection(
-        RejectionReason.GATE, message, Hint("judge", Advice.CHECK_REFERENCE_POSES, ADVICE, best[1] or None)
-    )
+    if any(it <= MAX_ERROR_PX for photograph in photographs for it in photograph.errors_px()):
+        return None
+    return _wrong_references("no two of the references that the pose rests on agree with their own poses", photographs)
+
+
+def _wrong_references(message: str, photographs: Sequence[Supporters]) -> Rejection:
+    """The rejection whose hint names the reference with the most inliers."""
+    counted = [pair for it in photographs for pair in zip(it.inlier_counts, it.names, strict=True)]
+    _, best = max(counted, default=(0, None))
+    return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.CHECK_REFERENCE_POSES, ADVICE, best))
 
 
 ADVICE = (
@@ -134,16 +120,14 @@ def unmoved_failure(
 
     The estimate of the support has passed the gate; for the others see `pnp.gate_failure`.
     """
-    query, estimate = support.query, support.estimate
-    assert estimate is not None
-    said = None
+    inliers, said = support.estimate.inliers, None
     for knows_same_view in (False, True):  # the comparison of whole photographs is seldom needed
-        moved = moved_matches(support, support.query_matches, options, knows_same_view)
-        unmoved_count = int((estimate.inliers & ~moved).sum())
+        moved = moved_matches(support, options, knows_same_view)
+        unmoved_count = int((inliers & ~moved).sum())
         if not unmoved_count:
             return None
-        kept, inliers = support.matches.select(moved), estimate.inliers[moved]
-        failure = gate_failure(query.camera, kept, inliers, inlier_px, log10_chance)
+        kept = support.matches.select(moved)
+        failure = gate_failure(support.query.camera, kept, inliers[moved], inlier_px, log10_chance)
         if failure is None:
             return None
         said = f"{without(unmoved_count)} {failure}"
@@ -157,16 +141,11 @@ def without(unmoved_count: int) -> str:
     )
 
 
-def moved_matches(
-    support: Support, query_matches: Sequence[Matches], options: StationaryOptions, knows_same_view: bool = True
-) -> NDArray[np.bool_]:
+def moved_matches(support: Support, options: StationaryOptions, knows_same_view: bool = True) -> NDArray[np.bool_]:
     """Returns which 2D-3D matches (M,) are evidence: their points are at other pixels in some reference.
 
-    Args:
-        support: the photograph, its references and its matches with points.
-        query_matches: of the photograph with each reference; they say whether both show the same view.
-        options: largest displacement of what is fixed.
-        knows_same_view: whether matches at the same pixels as in a reference count if both show the same view.
+    `options` have the largest displacement of what is fixed; `knows_same_view` is whether matches at the same pixels as
+    in a reference count if both show the same view.
     """
     query, references, structure, matches = support.query, support.references, support.structure, support.matches
     keypoint_of = np.full(len(structure.x_in_world), -1)
@@ -179,7 +158,7 @@ def moved_matches(
     is_moved = _are_moved(query, references, view, keypoint[rows], theirs, options)
     if knows_same_view:
         for i in np.unique(view[~is_moved]):
-            is_moved[view == i] |= shows_view_of(query, references[i], query_matches[i], options)
+            is_moved[view == i] |= shows_view_of(query, references[i], support.query_matches[i], options)
     moved = np.zeros(len(structure.x_in_world), bool)
     moved[point[is_moved]] = True
     return np.asarray(moved[matches.point])

@@ -14,13 +14,11 @@ Wrong matches of repeated texture agree with one another, so a second reference 
 its own matches. This share gives the trust: the share of right answers with one as low (see `judge`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from ..bundle.estimate import PosedSupport, TwoViewSupport
-from ..features.views import Matches
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..pose.pnp import disc_chance, false_alarms, format_false_alarms, log10_tail
 from ..pose.relative import PNP, band_chance
@@ -30,20 +28,18 @@ from .evidence import hull_px2
 from .references import moved_matches
 
 MAX_LOG10_POSE = -15.0
-"""Largest log10 of the expected number of such poses among wrong matches. Of 220 photographs with references of other
-places none was below -3."""
+"""Largest log10 of the expected number of such poses among wrong matches."""
 
 MAX_LOG10_DISTANCE = -5.0
 """The same limit for distances."""
 
 MIN_SECOND_SHARE = 0.35
-"""Least share of inliers among the matches of the reference with the second most inliers. On a statue that looks alike
-from several sides, wrong poses had up to 0.26, and one with a wrong focal length, off by 6 degrees, 0.32; of 31 right
-answers to photographs that failed otherwise 22 have more."""
+"""Least share of inliers among the matches of the reference with the second most inliers."""
 
 SHARES = (0.253, 0.256, 0.274, 0.288, 0.331, 0.432, 0.476, 0.636)
 LEVELS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
-"""Quantiles of the second reference's share of those right answers, and the shares of the answers that have less."""
+"""Quantiles of that share in right answers to photographs that failed otherwise, and the shares of those that have
+less."""
 
 MIN_HULL_SHARE = 0.04
 """Least share of the image covered by the convex hull of the inliers; see `groups.images`."""
@@ -72,16 +68,8 @@ class TwoViewEvidence:
     hull_share: float
 
 
-def two_view_evidence(support: PosedSupport, query_matches: Sequence[Matches]) -> TwoViewEvidence:
-    """Computes the evidence for the estimate of a support with two-view matches.
-
-    Args:
-        support: the support, with an estimate and two-view matches.
-        query_matches: matches of the query with each reference.
-
-    Raises:
-        ValueError: there is no estimate, or there are no two-view matches.
-    """
+def two_view_evidence(support: PosedSupport) -> TwoViewEvidence:
+    """Computes the evidence for the estimate of a support; ValueError if it has no two-view matches."""
     estimate, lines, matches, camera = support.estimate, support.two_view, support.matches, support.query.camera
     if lines is None:
         raise ValueError("support.two_view must not be None")
@@ -93,7 +81,7 @@ def two_view_evidence(support: PosedSupport, query_matches: Sequence[Matches]) -
         false_alarms(*points, disc) + log10_tail(*all_lines, band),
         false_alarms(*all_lines, band, sample=6) + log10_tail(*points, disc),
     )
-    every = TwoViewMatches.of(support.query, support.references, query_matches)
+    every = TwoViewMatches.of(support.query, support.references, support.query_matches)
     agreeing = every.sampson_px(estimate.world_from_camera) < EPIPOLAR_PX
     counts = np.bincount(every.reference[agreeing], minlength=len(support.references))
     strongest, second = np.argsort(-counts, kind="stable")[:2]
@@ -107,27 +95,25 @@ def two_view_evidence(support: PosedSupport, query_matches: Sequence[Matches]) -
         points[1] + all_lines[1],
         points[0] + all_lines[0],
         other_inliers,
-        float(counts[second] / max(1, len(query_matches[second]))),
+        float(counts[second] / max(1, len(support.query_matches[second]))),
         hull_px2(support.query.features.keypoints[keypoint]) / (camera.width_px * camera.height_px),
     )
 
 
-def without_unmoved(
-    support: PosedSupport, query_matches: Sequence[Matches], options: StationaryOptions
-) -> PosedSupport:
+def without_unmoved(support: PosedSupport, options: StationaryOptions) -> PosedSupport:
     """The support without matches at the same pixels as in the references, which may be fixed to the camera.
 
-    The arguments are those of `two_view_evidence`, and the largest displacement of what is fixed.
+    `options` have the largest displacement of what is fixed. ValueError if there are no two-view matches.
     """
-    estimate, lines, query, references = support.estimate, support.two_view, support.query, support.references
+    estimate, lines = support.estimate, support.two_view
     if lines is None:
         raise ValueError("support.two_view must not be None")
-    points = moved_matches(support, query_matches, options)
+    points = moved_matches(support, options)
     rows = np.ones(len(lines.reference), bool)
-    for i, reference in enumerate(references):
+    for i, (reference, matches) in enumerate(zip(support.references, support.query_matches, strict=True)):
         own = np.flatnonzero(lines.reference == i)
         pairs = np.stack([lines.keypoint[own], lines.reference_keypoint[own]], axis=1).astype(np.int32)
-        rows[own] = are_moved(query, reference, pairs, query_matches[i], options)
+        rows[own] = are_moved(support.query, reference, pairs, matches, options)
     if points.all() and rows.all():
         return support
     kept = replace(estimate, inliers=estimate.inliers[points], errors_px=estimate.errors_px[points])

@@ -293,6 +293,6 @@ class ReferencePairs:
             return strict
         similarity = first.view.features.unit_descriptors() @ second.view.features.unit_descriptors().T
         similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
-        added = best_of_both(similarity, self.options.wide_ratio, self.options.wide_similarity)
+        (added,) = best_of_both(similarity, (self.options.wide_ratio,), self.options.wide_similarity)
         taken = np.isin(added[:, 0], strict[:, 0]) | np.isin(added[:, 1], strict[:, 1])
         return np.concatenate([strict, added[~taken]])

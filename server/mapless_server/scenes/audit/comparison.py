@@ -183,8 +183,9 @@ class Comparison:
             fit.world_from_camera, PoseStage.REFINED, fit.inliers, fit.error_px, self._covariance_of(fit)
         )
         query, hood = replace(self.subject.view, camera=fit.camera), self.neighbourhood
-        support = PosedSupport(query, hood.references, hood.structure, self.matches, np.zeros(3), estimate=estimate)
-        rejection = judge(support, self.neighbour_matches, LocalizeOptions().coverage, JudgeOptions()).rejection
+        matched = self.matches, np.zeros(3), tuple(self.neighbour_matches)
+        support = PosedSupport(query, hood.references, hood.structure, *matched, estimate=estimate)
+        rejection = judge(support, LocalizeOptions().coverage, JudgeOptions()).rejection
         return f"another camera fits, but would be rejected as an answer: {rejection.message}" if rejection else ""
 
     def severity(

@@ -26,27 +26,17 @@ __all__ = [
 
 
 class FeatureExtractor(Protocol):
-    """Finds local features.
-
-    Attributes:
-        name: identifies the extractor and everything that changes its output; the key of stored features.
-    """
+    """Finds local features."""
 
     @property
     def name(self) -> str:
-        """Identifies the extractor and everything that changes its output."""
+        """Identifies the extractor and everything that changes its output; the key of stored features."""
         ...
 
     def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
-        """Finds the features of a photograph.
+        """The view of a photograph, (H, W, 3) uint8 RGB as stored in the file, possibly without keypoints.
 
-        Args:
-            image: (H, W, 3) uint8, RGB, as stored in the file.
-            camera: the photograph's camera, of the same size.
-            ignored: pixels of the image, at any size, near which no feature is found, see `masks`; None for none.
-
-        Returns:
-            The view of the photograph, possibly without keypoints (of a blank wall).
+        The camera has the same size; `ignored` are pixels, at any size, near which no feature is found, see `masks`.
         """
         ...
 

@@ -30,16 +30,8 @@ _AT_ONCE = 256
 class AlikedExtractor:
     """ALIKED. Scores are in 0 to 1: maxima of up to 0.006 in blank images, of about 0.02 in weakly textured rooms.
 
-    kornia's pixel coordinates are those used here: (0, 0) is the centre of the top-left pixel. Photographs reduced to
-    half and three quarters of their size have the same keypoints to 0.1 px, so there is no shift to correct.
-
-    Args:
-        weights: safetensors file, the names of the authors' checkpoint.
-        device: "cpu" or a CUDA device.
-        options: the defaults if None.
-
-    Raises:
-        CheckpointError: the weights do not fit.
+    kornia's pixel coordinates are those used here: (0, 0) is the centre of the top-left pixel. `weights` is a
+    safetensors file with the names of the authors' checkpoint; CheckpointError if they do not fit.
     """
 
     def __init__(self, weights: Path, device: str = "cpu", options: LearnedOptions | None = None) -> None:
@@ -78,9 +70,8 @@ class AlikedExtractor:
     def _peak_sizes_px(self, dispersities: torch.Tensor) -> NDArray[np.float32]:
         """Diameter of the score map's peak: four times the root mean square distance of the score from its centre.
 
-        The position of a wide peak is less certain: on surveyed photographs the matches of the widest sixth lie 1.6
-        times as far from their epipolar lines as those of the narrowest, as sizes times `structure.FIRST_GUESS.slope`
-        predict. A dispersity is that mean square, in squared radii of the window in which kornia searches the peak.
+        The position of a wide peak is less certain, as sizes times `FIRST_GUESS.slope` predict. A dispersity is that
+        mean square, in squared radii of the window in which kornia searches the peak.
         """
         return 4 * self._network.nms_radius * np.sqrt(array_of(dispersities))
 
@@ -126,9 +117,8 @@ def _size(x: torch.Tensor) -> torch.Tensor:
 def find_maps(network: ALIKED, image: torch.Tensor) -> Maps:
     """The scores and features of an image (1, 3, H, W) in 0 to 1; those of `ALIKED.extract_dense_map` to rounding.
 
-    That holds the features of all pixels three times, 580 MiB at 640x480. Here they are computed where a descriptor
-    needs them: the first layer of the scores weighs the channels alone, so it may precede the interpolation. Channels
-    lie side by side in memory, with which convolutions are faster.
+    That holds the features of all pixels, 580 MiB at 640x480. Here they are computed where a descriptor needs them: the
+    first layer of the scores weighs the channels alone, so it may precede the interpolation.
     """
     padder = InputPadder(image.shape[-2], image.shape[-1], 32)
     x1 = network.block1(padder.pad(image).contiguous(memory_format=torch.channels_last))

@@ -21,30 +21,18 @@ WINDOW_PX = 5
 """Side of the window in which a keypoint is the strongest pixel."""
 
 SIZE_OF_WIDTH = 12.0
-"""Size of a keypoint over the width of its peak, the square root of the inverse curvature of the logit.
-
-Of its flatter axis. The distances of matches from their epipolar lines grow with that width: 1.5 to 1.8 times from the
-narrowest sixth to the widest on four scenes. As an equally precise SIFT keypoint has 11, 12 and 13 times its width as
-its size on the drive, in the kitchen and at the fountain, sizes times the slope of `KeypointNoise` are its noise.
-"""
+"""Size of a keypoint over the width of its peak along the flatter axis, the square root of the inverse curvature of the
+logit: as that of an equally precise SIFT keypoint, so that sizes times the slope of `KeypointNoise` are its noise."""
 
 BORDER_PX = 4
 """Keypoints are at least so far from the image's border, where the network sees its padding."""
 
 
 class EdgePoint2Extractor:
-    """EdgePoint2. Scores are in 0 to 1, of which the authors' threshold is 0.0067, a logit of -5.
+    """EdgePoint2 "s64", "m64", "l64" or "e64". Scores are in 0 to 1; the authors' threshold is 0.0067, a logit of -5.
 
-    The authors' keypoints are whole pixels. Here a parabola through the logits finds them between pixels.
-
-    Args:
-        variant: "s64", "m64", "l64" or "e64".
-        weights: safetensors file, the names of the authors' checkpoint.
-        device: "cpu" or a CUDA device.
-        options: the defaults, with the authors' threshold, if None.
-
-    Raises:
-        CheckpointError: the weights do not fit.
+    The authors' keypoints are whole pixels; here a parabola through the logits finds them between pixels. `weights` is
+    a safetensors file with the names of the authors' checkpoint; CheckpointError if they do not fit.
     """
 
     def __init__(self, variant: str, weights: Path, device: str = "cpu", options: LearnedOptions | None = None) -> None:

@@ -75,16 +75,12 @@ def _on_both_sides(x: torch.Tensor, margin: int, axis: int) -> torch.Tensor:
     return torch.maximum(runs.narrow(axis, 0, count), runs.narrow(axis, margin + 1, count))
 
 
-def peak_offsets(heights: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+def peaks(heights: torch.Tensor, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Offsets (N, 2) from strict maxima to the peaks of parabolas through their neighbours, at most half a pixel.
 
-    The heights are a map (H, W), for example of scores or logits; the maxima, x and y, are not at the border.
+    Also the second derivatives (N, 2) of the parabolas, which are negative. The heights are a map (H, W), for example
+    of scores or logits; the maxima, x and y, are not at the border.
     """
-    return peaks(heights, pixels)[0]
-
-
-def peaks(heights: torch.Tensor, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the result of `peak_offsets`, and the second derivatives (N, 2) of the parabolas, which are negative."""
     x, y = pixels.unbind(1)
     here = heights[y, x]
     left, right, above, below = heights[y, x - 1], heights[y, x + 1], heights[y - 1, x], heights[y + 1, x]

@@ -23,14 +23,8 @@ WINDOW_PX = 9
 class SuperPointExtractor:
     """SuperPoint. A score is the probability of a pixel among its cell's 64; the authors' threshold is 0.005.
 
-    Args:
-        weights: safetensors file, transformers' names.
-        device: "cpu" or a CUDA device.
-        options: the defaults, with the authors' threshold, if None.
-        config: of the network; that of the authors' weights if None.
-
-    Raises:
-        CheckpointError: the weights do not fit.
+    `weights` is a safetensors file with transformers' names; CheckpointError if they do not fit. `config` is that of
+    the authors' weights by default.
     """
 
     def __init__(

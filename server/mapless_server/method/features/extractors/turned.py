@@ -20,18 +20,10 @@ def extract_turned(
     clockwise_quarter_turns: int,
     ignored: Ignored | None = None,
 ) -> View:
-    """Finds the features of a photograph in its turned raster.
+    """Finds the features of a photograph, see FeatureExtractor.extract, in its raster turned by 0 to 3 quarters.
 
-    Args:
-        extractor: finds them.
-        image: (H, W, 3) uint8, RGB, as stored in the file.
-        camera: the photograph's camera, of the same size.
-        clockwise_quarter_turns: by which the raster is turned, 0 to 3.
-        ignored: ignored pixels of the image as it is stored, see FeatureExtractor.extract.
-
-    Returns:
-        The view that the extractor gives, in pixels of the raster that is not turned; only its descriptors are those of
-        the turned one.
+    Returns the view that the extractor gives, in pixels of the raster that is not turned; only its descriptors are
+    those of the turned one.
     """
     sides = camera.width_px, camera.height_px
     width, height = sides[::-1] if clockwise_quarter_turns % 2 else sides

@@ -13,7 +13,7 @@ from mapless_server.networks.local_features import load_xfeat
 
 from ..masks import usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
-from .network import LearnedOptions, among_usable, array_of, image_tensor, peak_offsets, strict_maxima
+from .network import LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
 
 MULTIPLE_PX = 32
 """Sides of the images that the network takes."""
@@ -22,24 +22,15 @@ WINDOW_PX = 5
 """Side of the window in which a keypoint is the strongest pixel."""
 
 SHIFT_PX = 0.4
-"""From a maximum of the keypoint map to the image point, right and down. The map has the pixel coordinates used here,
-but the weights were trained with positions rounded down. Measured by reducing surveyed photographs to 0.5 and 0.75 of
-their size, where the same shift in pixels is larger on the photograph: 0.47 (x) and 0.36 (y), each to 0.03."""
+"""From a maximum of the keypoint map to the image point, right and down: the map has the pixel coordinates used here,
+but the weights were trained with positions rounded down."""
 
 
 class XfeatExtractor:
     """XFeat's sparse features. Scores are the keypoint map's, in 0 to 1; the authors' threshold is 0.05.
 
-    The authors' keypoints are whole pixels. Here a parabola through the logarithm of the map finds them between pixels,
-    which reduces the distance of matches from their epipolar lines, on surveyed photographs, from 0.45 to 0.35 px.
-
-    Args:
-        weights: safetensors file, the names of the authors' checkpoint.
-        device: "cpu" or a CUDA device.
-        options: the defaults, with the authors' threshold, if None.
-
-    Raises:
-        CheckpointError: the weights do not fit.
+    The authors' keypoints are whole pixels; here a parabola through the logarithm of the map finds them between pixels.
+    `weights` is a safetensors file with the names of the authors' checkpoint; CheckpointError if they do not fit.
     """
 
     def __init__(self, weights: Path, device: str = "cpu", options: LearnedOptions | None = None) -> None:
@@ -66,7 +57,7 @@ class XfeatExtractor:
         descriptors = InterpolateSparse2d("bicubic")(normalize(feature_map, dim=1), pixels[None], height, width)[0]
         return view_of(
             reduced_camera,
-            array_of(pixels + peak_offsets(log_heat, pixels)).astype(np.float64) + SHIFT_PX,
+            array_of(pixels + peaks(log_heat, pixels)[0]).astype(np.float64) + SHIFT_PX,
             array_of(normalize(descriptors, dim=1)),
             np.full(len(pixels), WINDOW_PX, np.float32),
         )
