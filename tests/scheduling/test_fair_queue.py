@@ -31,7 +31,7 @@ class Waiting:
         self._costs_s[job], self._flows[job] = cost_s, flow
 
     def pop(self) -> Any:
-        job = self.queue.pop(self._costs_s.__getitem__)
+        job = self.queue.pop(lambda job: self.shares.charge(self._flows[job], self._costs_s[job]))
         self.shares.leave(self._flows[job])
         return job
 

@@ -1,4 +1,4 @@
-"""Steps that need more than their jobs were admitted with, such as second attempts: when they are computed."""
+"""Further steps, which jobs were not admitted with, such as second attempts: when they are computed."""
 
 import pytest
 from support.toy_scheduler import FAR_S, Toy, run_through
@@ -20,11 +20,11 @@ def again(toy: Toy, kind: str, others: int, due_s: float = 150.0) -> AnyJob:
 @pytest.mark.parametrize(
     ("kind", "others", "is_last"), [("toy", 0, False), ("toy", 6, True), ("slow", 0, False), ("slow", 1, True)]
 )
-def test_more_than_admitted_waits_for_an_idle_thread(kind: str, others: int, is_last: bool) -> None:
-    """Where others have the room; the only job is computed whatever it costs, as it is admitted."""
+def test_a_further_step_waits_for_an_idle_thread(kind: str, others: int, is_last: bool) -> None:
+    """Whatever it costs, and whatever room there is."""
     toy = Toy()
     job = again(toy, kind, others)
-    assert (toy.ending_of(job), bool(job.booked_s)) == (None, not is_last)
+    assert (toy.ending_of(job), bool(job.booked_s)) == (None, False)
     order = []
     while toy.scheduler.has_work("host"):
         batch = toy.take("host")
@@ -32,6 +32,36 @@ def test_more_than_admitted_waits_for_an_idle_thread(kind: str, others: int, is_
         toy.finish(batch, *(Done(None) for _ in batch.jobs))
     assert order[-1 if is_last else 0] is job
     assert (job.begins_until_s, toy.ending_of(job)) == (None, Ending.OK)
+
+
+def test_further_steps_together_have_the_share_of_one_caller() -> None:
+    """Of however many callers they are, beside one whose jobs never end."""
+    toy, asides = Toy(), []
+    for i in range(20):
+        toy.admit(stage="refine", client=f"doubtful {i}")
+        toy.finish(toy.take("host"), Next((Step("prepare", "toy", "b", i),), Fallback(lambda _: Done(None), FAR_S)))
+    while len(asides) < 20:
+        toy.fill("busy")
+        batch = toy.take("host")
+        asides.append(batch.jobs[0].is_aside)
+        toy.finish(batch, Done(None))
+    assert sum(asides) == 7
+
+
+def test_a_further_step_is_charged_to_its_caller_too() -> None:
+    """Who has been given more than another by further steps waits longer with the next job, as for any step."""
+    toy = Toy()
+    for client in ("other", "mine"):  # so that they have begun alike
+        toy.admit(client=client)
+    run_through(toy)
+    job = toy.admit(stage="refine", client="mine")
+    toy.finish(toy.take("host"), Next((Step("prepare", "toy", "b", 0),), Fallback(lambda _: Done(None), FAR_S)))
+    toy.finish(toy.take("host"), Done(None))
+    assert job.is_over
+    toy.admit(stage="refine", client="other")
+    toy.finish(toy.take("host"), Done(None))
+    mine, other = toy.admit(client="mine"), toy.admit(client="other")
+    assert [toy.take("host").jobs[0] for _ in range(2)] == [other, mine]
 
 
 def test_a_step_beyond_the_bounds_takes_no_room() -> None:
@@ -112,10 +142,10 @@ def test_a_greedy_caller_takes_no_others_turn(is_crowded: bool, own_jobs: int, d
 
 @pytest.mark.parametrize(
     ("due_s", "others", "kind"),
-    [(3.0, 0, "slow"), (1.0, 0, "toy"), (FAR_S, 5, "toy"), (0.7, 0, None), (0.7, 6, None)],
+    [(3.0, 0, "slow"), (1.0, 0, "toy"), (2.9, 5, "toy"), (0.7, 0, None), (0.7, 6, None)],
 )
 def test_the_alternative_is_computed_where_the_step_is_not(due_s: float, others: int, kind: str | None) -> None:
-    """Too late or too much for the room; the fallback is given only if the alternative is too late as well."""
+    """Where that would be too late; the fallback is given only if the alternative is too late as well."""
     toy = Toy()
     toy.learn("prepare", "slow", 2.0)
     toy.learn("refine", "another", 50.0)  # says nothing about `later_kind`
@@ -137,17 +167,6 @@ def test_the_first_step_that_ends_in_time_is_computed(due_s: float, kind: str | 
     job = toy.admit(stage="refine", client="mine")
     toy.finish(toy.take("host"), Next(steps, Fallback(lambda _: Done("first"), due_s)))
     assert (job.step.kind if kind else None, toy.ending_of(job)) == (kind, None if kind else Ending.OK)
-
-
-def test_of_steps_too_costly_for_the_room_the_last_waits() -> None:
-    toy = Toy()
-    toy.learn("prepare", "slow", 20.0)
-    job = toy.admit(stage="refine", client="mine")
-    for i in range(6):
-        toy.admit(client=f"other {i}")
-    steps = tuple(Step("prepare", kind, "b", 0) for kind in ("slow", "slow", "toy"))
-    toy.finish(toy.take("host"), Next(steps, Fallback(lambda _: Done("first"), FAR_S)))
-    assert (job.step.kind, job.begins_until_s is None, toy.ending_of(job)) == ("toy", False, None)
 
 
 def test_steps_but_the_cheapest_are_never_tried_anyway() -> None:

@@ -129,7 +129,7 @@ def onward(job: AnyJob, fallback: AnyFallback | None = None) -> AnyResult:
     stage = next(it for it in STAGES if it.name == job.step.stage)
     if stage.then is None:
         return Done("result")
-    return Next((Step(stage.then, "toy", job.step.bucket, job.step.payload),), fallback)
+    return Next((Step(stage.then, "toy", job.step.bucket, job.step.payload),), fallback, is_admitted=True)
 
 
 def run_through(toy: Toy) -> None:

@@ -3,6 +3,7 @@
 Also whether the photograph matches them more if it is turned, and whether references elsewhere contradict its pose.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,15 +14,19 @@ from mapless_server.engine.query import QueryViews, RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
 from mapless_server.method.judge.decide import CLEARLY_MORE
-from mapless_server.method.judge.hypothesis import Hypothesis, Where
+from mapless_server.method.judge.hypothesis import Found, Hypothesis, Where
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Choice, Narrowing, Selection
 from mapless_server.scenes.library import Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
+from mapless_server.scheduling import Abandoned, Failure
 
 from . import tracking
+from .failures import failure_of
 from .query import TURN, Tier
 from .search import Search
+
+log = logging.getLogger(__name__)
 
 SHORTLIST = 2
 """So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
@@ -85,11 +90,24 @@ def turned_to_match(search: Search, tier: Tier) -> RasterForm | Rejection:
     return forms[turned.index(best) if best[0] >= CLEARLY_MORE * turned[0][0] else 0]
 
 
-def resembles_elsewhere(search: Search, found: Hypothesis, tier: Tier) -> bool:
+def resembles_elsewhere(search: Search, found: Found, tier: Tier) -> bool:
     """Whether soft priors may have led to the wrong references, though the photograph was localized.
 
-    The reference that resembles it most is then not where they say, and references elsewhere contradict the pose.
+    The reference that resembles it most is then not where they say, and references elsewhere contradict the pose. If
+    that cannot be found out, it is not, so that the answer that there is remains.
     """
+    if not isinstance(found, Hypothesis) or not found.is_accepted or search.attempt.where is not Where.LIKELY:
+        return False
+    try:
+        return _is_contradicted_elsewhere(search, found, tier)
+    except Exception as error:
+        if isinstance(error, Abandoned) or failure_of(error) is Failure.DEVICE_LOST:
+            raise
+        log.warning("references elsewhere could not be compared; the first answer is given", exc_info=error)
+        return False
+
+
+def _is_contradicted_elsewhere(search: Search, found: Hypothesis, tier: Tier) -> bool:
     material = search.material
     assert material is not None
     assert material.choice is not None

@@ -104,7 +104,13 @@ class QueryStages:
         """Reconstructs many queries together, and estimates the metric scale of each."""
         begin_s, start_s = processor_s(), time.monotonic()
         searches = [job.step.payload for job in jobs]
-        made = self._method.reconstruct([it.prepared for it in searches if it.prepared is not None])
+        made: list[Coarse | Exception]
+        try:
+            made = self._method.reconstruct([it.prepared for it in searches if it.prepared is not None])
+        except Exception as error:
+            if len(jobs) > 1:  # the queue computes halves of them
+                raise
+            made = [error]
         share_s = (processor_s() - begin_s) / len(jobs)
         took_s = time.monotonic() - start_s
         spent = [
@@ -311,7 +317,7 @@ class QueryStages:
         if search.on_better is not None and isinstance(result.answer.outcome, Localization):
             search.on_better(result)
         done = Done(result, Ending.DEGRADED)
-        return Next((step,), Fallback(lambda _: done, search.deadline_s - ANSWER_MARGIN_S))
+        return Next((step,), Fallback(lambda _: done, search.deadline_s - ANSWER_MARGIN_S), is_admitted=True)
 
     def _refine(self, search: Search) -> SearchResult:
         coarse, attempt = search.coarse, search.attempt
@@ -329,7 +335,8 @@ class QueryStages:
             raise ArithmeticError(f"the method's answer is not finite: {found.answer.outcome}, {found.answer.scale}")
         search.context.stage_seconds.update(found.answer.stage_seconds)
         found = self._verdicts.within_limits(search, found)
-        if self._is_like_elsewhere(search, found):
+        may_be_elsewhere = search.situation(self._tiers).may_be_elsewhere
+        if may_be_elsewhere and choosing.resembles_elsewhere(search, found, self._verdicts.tier(search.attempt)):
             found = replace(found, doubts=found.doubts | Doubt.LIKE_ELSEWHERE)
         outcome, material = found.answer.outcome, search.material or search.materials[-1]
         ended = "localized" if isinstance(outcome, Localization) else outcome.reason.value
@@ -383,20 +390,6 @@ class QueryStages:
     def _unfinished(self, search: Search, outcome: str) -> Done[Result]:
         answered = self._verdicts.without_present(search, outcome)
         return Done(answered, _ending(answered))
-
-    def _is_like_elsewhere(self, search: Search, found: Found) -> bool:
-        """`resembles_elsewhere`, except that its failure does not cost the answer that there is."""
-        if not isinstance(found, Hypothesis) or not found.is_accepted or search.attempt.where is not Where.LIKELY:
-            return False
-        if not search.situation(self._tiers).may_be_elsewhere:
-            return False
-        try:
-            return choosing.resembles_elsewhere(search, found, self._verdicts.tier(search.attempt))
-        except Exception as error:
-            if isinstance(error, Abandoned) or failure_of(error) is Failure.DEVICE_LOST:
-                raise
-            log.warning("references elsewhere could not be compared; the first answer is given", exc_info=error)
-            return False
 
 
 def _ending(result: Result) -> Ending:

@@ -88,7 +88,7 @@ class Ledger:
         job.booked_s = cost_s
 
     def set_aside(self, job: AnyJob) -> None:
-        """Counts a job for nothing but its memory, because it waits until a thread is idle otherwise."""
+        """Counts a job for nothing but its memory, because it waits aside for a further step."""
         self.rebook(job, Counter())
         self._aside.add(job)
         for holdings in self._holding(job.flow):
@@ -137,10 +137,6 @@ class Ledger:
     def job_count(self, flow: Flow | None = None) -> int:
         """Number of jobs of one client, or of all, without those that are set aside."""
         return self._of(flow).in_order
-
-    def job_count_of_caller(self, flow: Flow) -> int:
-        """Number of jobs of a client's caller, without those that are set aside."""
-        return self._callers.get(flow.group, _NOTHING).in_order
 
     def booked_s(self, lane: str, flow: Flow | None = None) -> float:
         """Computing time predicted for the jobs of one client, or of all."""
@@ -296,16 +292,6 @@ class Admission:
         most = self._options.max_bytes
         if size_bytes > most:
             raise Refused(Refusal.TOO_LARGE, f"the call holds {size_bytes} bytes, {most} are allowed")
-
-    def fits(self, job: AnyJob, cost_s: Counter[str]) -> bool:
-        """Whether an admitted job may continue although it now needs more than it was admitted with.
-
-        The only job may, since no other job waits.
-        """
-        if len(self._ledger.jobs) == 1:
-            return True
-        added_s = {lane: own_s - job.booked_s[lane] for lane, own_s in cost_s.items()}
-        return all(it <= 0 or self._excess_s(job.flow, lane, it) <= 0 for lane, it in added_s.items())
 
     def has_turn(self, job: AnyJob, cost_s: Counter[str]) -> bool:
         """Whether an admitted job, its client's only one, may continue although the share is too small for it.

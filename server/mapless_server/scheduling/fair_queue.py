@@ -1,5 +1,7 @@
 """The jobs that wait for a stage, in the order in which they are to be computed."""
 
+from __future__ import annotations
+
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from typing import Generic, TypeVar
@@ -38,6 +40,11 @@ class FairQueue(Generic[J]):
         """Sum of the costs of all waiting jobs."""
         return self._cost_s if self._flow_of else 0.0  # without rounding errors
 
+    @property
+    def turn(self) -> tuple[float | int, ...] | None:
+        """That of the client who is served next, by `Shares.turn`; None if nothing waits."""
+        return min(map(self._shares.turn, self._jobs), default=None)
+
     def push(self, job: J, flow: Flow, cost_s: float) -> None:
         """Adds a job behind those of its client."""
         self._jobs.setdefault(flow, OrderedDict())[job] = cost_s
@@ -53,8 +60,8 @@ class FairQueue(Generic[J]):
         self._cost_s -= cost_s
         return cost_s
 
-    def pop(self, charge_s: Callable[[J], float], is_allowed: Callable[[J], bool] = lambda _: True) -> J:
-        """Removes the next of the allowed jobs and charges its client for it; raises IndexError if none waits."""
+    def pop(self, charge: Callable[[J], object], is_allowed: Callable[[J], bool] = lambda _: True) -> J:
+        """Removes the next of the allowed jobs, and charges it; raises IndexError if none waits."""
         first = {flow: next(filter(is_allowed, jobs), None) for flow, jobs in self._jobs.items()}
         waiting = [flow for flow, job in first.items() if job is not None]
         if not waiting:
@@ -63,5 +70,35 @@ class FairQueue(Generic[J]):
         job = first[flow]
         assert job is not None
         self.remove(job)
-        self._shares.charge(flow, charge_s(job))
+        charge(job)
         return job
+
+
+FURTHER = "further steps\n"
+"""The caller that all further steps of a tenant are; no caller can send a name with a line break."""
+
+
+class FurtherQueue(FairQueue[J]):
+    """Waiting jobs whose further steps were not admitted: together they get the share of one more caller.
+
+    However many callers there are whose photographs are tried again and again, the others then keep their shares.
+    Among the further steps those of each caller get an equal share.
+    """
+
+    def push(self, job: J, flow: Flow, cost_s: float) -> None:
+        """Adds a job behind those of its caller."""
+        flow = further(flow)
+        self._shares.enter(flow)
+        super().push(job, flow, cost_s)
+
+    def remove(self, job: J) -> float:
+        """Removes a job; returns its cost."""
+        flow = self._flow_of[job]
+        cost_s = super().remove(job)
+        self._shares.leave(flow)
+        return cost_s
+
+
+def further(flow: Flow) -> Flow:
+    """As whom a client's further steps are charged."""
+    return Flow(flow.tenant, FURTHER, flow.caller)

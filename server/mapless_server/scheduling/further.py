@@ -2,13 +2,13 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from enum import Enum, auto
 from typing import NamedTuple
 
 from .admission import Admission, Ledger, WorkQueueOptions
 from .costs import StageCosts
-from .jobs import AnyJob, AnyStep, Flow, Stage
+from .jobs import AnyJob, AnyNext, AnyStep, Flow, Stage
 from .lanes import Lane
 
 _TRY_ONE_IN = 8
@@ -18,8 +18,8 @@ class When(Enum):
     """When a further step is computed."""
 
     IN_ORDER = auto()
-    WHEN_IDLE = auto()
-    """When a thread would be idle otherwise."""
+    ASIDE = auto()
+    """When a thread would be idle otherwise, or the further steps of all callers together have their turn."""
     NEVER = auto()
 
 
@@ -60,43 +60,49 @@ class Further:
         if not self._has_most(flow):
             self._crowded_s = now_s
 
-    def choose(self, job: AnyJob, steps: Sequence[AnyStep], now_s: float) -> Choice:
-        """Chooses the first step that ends before the job is due and fits within the bounds.
+    def choose(self, job: AnyJob, following: AnyNext, now_s: float) -> Choice:
+        """Chooses the first step that ends before the job is due, after all that was admitted.
 
-        If none does, the cheapest waits for an idle thread; or, if no thread will be idle because other callers ask for
-        more than their share, for its turn; or none is computed.
+        If none does, or jobs are refused, the cheapest waits for its turn among the jobs of callers that ask for more
+        than their share; or none is computed. A step that the job was admitted with is computed if it ends in time.
         """
-        costs = [(step, self._costs.of(step, job.flow, now_s)) for step in steps]
+        costs = [(step, self._costs.of(step, job.flow, now_s)) for step in following.steps]
+        if following.is_admitted:
+            step, cost_s = costs[0]
+            is_computed = now_s + self._wait_s(step, now_s) + cost_s.total() <= job.due_s or self._is_tried_anyway(step)
+            return Choice(step, When.IN_ORDER if is_computed else When.NEVER, cost_s)
+        before_s = self._before_s(job)
         for step, cost_s in costs:
-            if self._is_worthwhile(job, step, cost_s, now_s):
-                return Choice(step, When.IN_ORDER, cost_s)
+            if self._may_wait(job, cost_s, before_s, now_s):
+                return Choice(step, When.ASIDE, cost_s)
         step, cost_s = min(costs, key=lambda it: it[1].total())
-        if self._may_wait(job, cost_s, now_s):
-            return Choice(step, When.WHEN_IDLE, cost_s)
         # Those that cost more are never tried anyway: that could cost what the cheapest gives.
         is_computed = self._has_turn(job, cost_s, now_s) or self._is_tried_anyway(step)
         return Choice(step, When.IN_ORDER if is_computed else When.NEVER, cost_s)
 
-    def _is_worthwhile(self, job: AnyJob, step: AnyStep, cost_s: Counter[str], now_s: float) -> bool:
-        """Whether a job's step fits within the bounds and ends before the job is due."""
+    def _wait_s(self, step: AnyStep, now_s: float) -> float:
+        """Time until the jobs that come before a step in order have been computed."""
         stage = self._stages[step.stage]
         lane = self._lanes[stage.lane]
         coming_first = lane.queues[lane.stages.index(stage) :]
-        wait_s = sum(self._costs.of_step(other, now_s) for queue in coming_first for other in queue)
-        return self._admission.fits(job, cost_s) and now_s + wait_s / lane.threads + cost_s.total() <= job.due_s
+        return sum(self._costs.of_step(other, now_s) for queue in coming_first for other in queue) / lane.threads
 
-    def _may_wait(self, job: AnyJob, cost_s: Counter[str], now_s: float) -> bool:
-        """Whether a step beyond the bounds can be computed in time when all that is admitted has been.
-
-        It does not wait if jobs were refused lately: more come than is computed, so that its turn would never come.
-        """
-        if self._is_recent(self._refused_s, now_s):
-            return False
-        before_s = (
-            (self._ledger.booked_s(name) + sum(it.cost_s for it in lane.spare)) / lane.threads
+    def _before_s(self, job: AnyJob) -> float:
+        """Time until what is admitted, and what is set aside, has been computed, without the job."""
+        return max(
+            (self._ledger.booked_s(name) - job.booked_s[name] + sum(it.cost_s for it in lane.aside)) / lane.threads
             for name, lane in self._lanes.items()
         )
-        return now_s + max(before_s) + cost_s.total() <= job.due_s
+
+    def _may_wait(self, job: AnyJob, cost_s: Counter[str], before_s: float, now_s: float) -> bool:
+        """Whether a step can be computed in time after so much else.
+
+        It does not wait if jobs were refused lately: more come than is computed, so that its turn would hardly come.
+        The only job does, since it waits for nothing.
+        """
+        if self._is_recent(self._refused_s, now_s) and len(self._ledger.jobs) > 1:
+            return False
+        return now_s + before_s + cost_s.total() <= job.due_s
 
     def _has_turn(self, job: AnyJob, cost_s: Counter[str], now_s: float) -> bool:
         """Whether a step beyond the bounds takes turns with the jobs of callers that ask for more than their share."""

@@ -106,7 +106,7 @@ class Stage:
 class StageLoad(NamedTuple):
     """The jobs that wait for a stage, their predicted computing time from there on, and the jobs that it computes.
 
-    The time is without that of jobs that wait until a thread is idle otherwise: it shows how far the queue is filled.
+    The time is without that of further steps, which wait aside: it shows how far the queue is filled.
     """
 
     waiting: int
@@ -156,14 +156,20 @@ class Fallback(Generic[PayloadT, ValueT]):
 class Next(Generic[PayloadT, ValueT]):
     """The job needs another step. From now on it ends with the fallback, if there is one, instead of expiring.
 
-    With a fallback, the first of the steps that is predicted to end in time, and to cost no more than there is room for
-    beside the other jobs, is computed. If none is, the cheapest waits until a thread would be idle otherwise, and the
-    fallback is given at once if that would be too late. So the steps are in order of preference. Without a fallback the
-    first is computed.
+    With a fallback, the steps are further ones, in order of preference, unless the job was admitted with them. The
+    first that is predicted to end in time is computed when a thread would be idle otherwise, or the further steps of
+    all callers, which are like one more caller, have their turn. If none is, the fallback is given at once. Without a
+    fallback the first is computed.
+
+    Attributes:
+        steps: one of them is computed.
+        fallback: what the job ends with if no step leads to a result in time.
+        is_admitted: whether the job was admitted with these steps, which then wait with those of other jobs.
     """
 
     steps: tuple[Step[PayloadT], ...]
     fallback: Fallback[PayloadT, ValueT] | None = None
+    is_admitted: bool = False
 
     def __post_init__(self) -> None:
         if not self.steps:
@@ -231,7 +237,8 @@ class Job(Generic[PayloadT, ValueT]):
         used_s: computing time so far.
         fallback: replaces expiry.
         waits_since_s: when it began to wait for the step, by the queue's clock.
-        begins_until_s: until when it waits for a thread that is idle otherwise; None if it does not wait so.
+        begins_until_s: until when it waits aside for a further step; None if it does not wait so.
+        is_aside: whether its current step is a further one, which waits or has waited aside.
         booked_s: computing time still predicted for it, by lane.
         charged_s: computing time charged to its tenant at admission.
         charged_step_s: computing time charged to its owner for the current step, as predicted.
@@ -251,6 +258,7 @@ class Job(Generic[PayloadT, ValueT]):
     fallback: Fallback[PayloadT, ValueT] | None = None
     waits_since_s: float = 0.0
     begins_until_s: float | None = None
+    is_aside: bool = False
     booked_s: Counter[str] = field(default_factory=Counter)
     charged_s: float = 0.0
     charged_step_s: float = 0.0
@@ -321,7 +329,7 @@ class Observer:
         """A job was refused."""
 
     def waited(self, stage: str, seconds: float) -> None:
-        """A job was taken from a stage's waiting jobs after this time; not called if it waited for an idle thread."""
+        """A job was taken from a stage's waiting jobs after this time; not called if it waited aside."""
 
     def computed(self, stage: str, bucket: str, jobs: int, seconds: float) -> None:
         """A batch of this many jobs of a bucket was computed."""

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from .fair_queue import FairQueue
+from .fair_queue import FairQueue, FurtherQueue
 from .jobs import AnyJob, Flow, Stage
 
 _ARRIVALS = 64
@@ -18,7 +18,7 @@ class Lane:
         threads: number of threads.
         stages: the stages that they compute, in the order in which jobs go through them.
         queues: the jobs that wait for each of them.
-        spare: those that wait for each until a thread would be idle otherwise.
+        aside: those that wait for each until a thread would be idle otherwise, or their turn as one caller comes.
         free: number of idle threads.
         passed_over: batches since the first stage that has waiting jobs was served.
         busy_s: sum of the threads' computing times so far.
@@ -29,12 +29,18 @@ class Lane:
     threads: int
     stages: Sequence[Stage]
     queues: Sequence[FairQueue[AnyJob]]
-    spare: Sequence[FairQueue[AnyJob]]
+    aside: Sequence[FurtherQueue[AnyJob]]
     free: int
     passed_over: int = 0
     busy_s: float = 0.0
     long: set[int] = field(default_factory=set)
     arrivals: deque[tuple[Flow, float, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
+
+    @property
+    def is_turn_of_aside(self) -> bool:
+        """Whether those that wait aside come before those that wait in order."""
+        aside, in_order = ([turn for it in of if (turn := it.turn)] for of in (self.aside, self.queues))
+        return bool(aside) and (not in_order or min(aside) < min(in_order))
 
     @property
     def has_one_left(self) -> bool:

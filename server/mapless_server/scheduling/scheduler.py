@@ -12,7 +12,7 @@ from dataclasses import replace
 from .admission import Admission, Ledger, WorkQueueOptions
 from .costs import MAX_OF_CALLERS, CostModel, StageCosts
 from .expected import Expected
-from .fair_queue import FairQueue
+from .fair_queue import FairQueue, FurtherQueue, further
 from .further import Further, When
 from .jobs import (
     Abandoned,
@@ -74,14 +74,14 @@ class Scheduler:
         self._stage_costs = StageCosts(self.costs, self._stages)
         self._shares = Shares()
         self._queues: dict[str, FairQueue[AnyJob]] = {stage.name: FairQueue(self._shares) for stage in stages}
-        # Steps of admitted jobs that need more room than there is: computed by threads that are idle otherwise.
-        self._spare: dict[str, FairQueue[AnyJob]] = {stage.name: FairQueue(self._shares) for stage in stages}
+        # Further steps of admitted jobs, which were not admitted with them.
+        self._aside: dict[str, FurtherQueue[AnyJob]] = {it.name: FurtherQueue(self._shares) for it in stages}
         self._running: Counter[str] = Counter()
         self._lanes: dict[str, Lane] = {}
         for name, count in lanes.items():
             own = [stage for stage in stages if stage.lane == name]
-            queues, spare = ([them[stage.name] for stage in own] for them in (self._queues, self._spare))
-            self._lanes[name] = Lane(count, own, queues, spare, count)
+            queues, aside = [self._queues[it.name] for it in own], [self._aside[it.name] for it in own]
+            self._lanes[name] = Lane(count, own, queues, aside, count)
         self._limits: dict[tuple[str, str], BatchLimit] = {}
         self._first_steps: OrderedDict[tuple[tuple[str, str], str], AnyStep] = OrderedDict()
         self._ledger = Ledger(self._shares)
@@ -112,8 +112,8 @@ class Scheduler:
 
     def load(self, stage: str) -> StageLoad:
         """The jobs of a stage."""
-        queue, spare = self._queues[stage], self._spare[stage]
-        return StageLoad(len(queue) + len(spare), queue.cost_s, self._running[stage])
+        queue, aside = self._queues[stage], self._aside[stage]
+        return StageLoad(len(queue) + len(aside), queue.cost_s, self._running[stage])
 
     def admit(self, job: AnyJob, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
@@ -154,7 +154,7 @@ class Scheduler:
     def has_work(self, lane_name: str) -> bool:
         """Whether a job waits for an idle thread of a lane."""
         lane = self._lanes[lane_name]
-        return lane.free > 0 and (any(lane.queues) or any(lane.spare))
+        return lane.free > 0 and (any(lane.queues) or any(lane.aside))
 
     def take(self, lane_name: str, now_s: float) -> Batch | None:
         """Selects what a thread of a lane computes now; None if all threads are busy or no job waits."""
@@ -177,8 +177,10 @@ class Scheduler:
             return not (expected.shorter(job.flow, step_s) or expected.first(job.flow))
 
         waiting = [it for it, queue in zip(lane.stages, lane.queues, strict=True) if any(map(is_allowed, queue))]
-        if not waiting:
-            return self._take_spare(lane, is_allowed, now_s)
+        if not waiting or lane.is_turn_of_aside:
+            batch = self._take_aside(lane, is_allowed, now_s)
+            if batch is not None or not waiting:
+                return batch
         # Late stages first: jobs that have begun hold memory, and time has been spent on them.
         is_first_due = lane.passed_over >= FIRST_STAGE_INTERVAL - 1
         stage = waiting[0] if is_first_due else waiting[-1]
@@ -188,12 +190,12 @@ class Scheduler:
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         return self._begin(lane, stage, jobs, now_s)
 
-    def _take_spare(self, lane: Lane, is_allowed: Callable[[AnyJob], bool], now_s: float) -> Batch | None:
-        """Selects, for a thread that nothing else waits for, steps that need more room than there was."""
-        stages = [it for it, queue in zip(lane.stages, lane.spare, strict=True) if any(map(is_allowed, queue))]
+    def _take_aside(self, lane: Lane, is_allowed: Callable[[AnyJob], bool], now_s: float) -> Batch | None:
+        """Selects further steps that wait aside."""
+        stages = [it for it, queue in zip(lane.stages, lane.aside, strict=True) if any(map(is_allowed, queue))]
         if not stages:
             return None
-        jobs = self._pop_batch(self._spare[stages[-1].name], stages[-1], is_allowed, now_s)
+        jobs = self._pop_batch(self._aside[stages[-1].name], stages[-1], is_allowed, now_s)
         for job in jobs:
             job.begins_until_s = None
             self._timers.set(job)
@@ -233,7 +235,8 @@ class Scheduler:
             is_slow = isinstance(result, Abandoned) and usual_s > self._stage_costs.of_step(job, now_s)
             if is_slow or not isinstance(result, Exception):
                 self._stage_costs.learn(job, usual_s, isinstance(result, Done), now_s)
-            self._shares.charge(job.flow, share_s - job.charged_step_s)
+            self._charge(job, share_s - job.charged_step_s)
+            job.is_aside = False
             job.used_s += share_s
             job.unusual_s = 0.0
             job.is_computed = False
@@ -313,13 +316,14 @@ class Scheduler:
             in_order_s = cost_s.total()
             cost_s &= job.booked_s  # it was admitted for no more
         else:
-            job.step, when, cost_s = self._further.choose(job, result.steps, now_s)
+            job.step, when, cost_s = self._further.choose(job, result, now_s)
             in_order_s = cost_s.total()
             if when is When.NEVER:
                 self._give_fallback(job, job.fallback, now_s)
                 return
-            if when is When.WHEN_IDLE:
+            if when is When.ASIDE:
                 self._ledger.set_aside(job)
+                job.is_aside = True
                 job.begins_until_s = job.due_s - in_order_s
                 self._enqueue(job, in_order_s, now_s)
                 return
@@ -336,25 +340,31 @@ class Scheduler:
 
     def _queue_of(self, job: AnyJob) -> FairQueue[AnyJob]:
         """The queue in which a job waits for its step."""
-        return (self._queues if job.begins_until_s is None else self._spare)[job.step.stage]
+        return (self._queues if job.begins_until_s is None else self._aside)[job.step.stage]
 
     def _pop_batch(
         self, queue: FairQueue[AnyJob], stage: Stage, is_allowed: Callable[[AnyJob], bool], now_s: float
     ) -> tuple[AnyJob, ...]:
         """Removes the next job and others to be computed with it, and charges for them what is predicted."""
 
-        def charge_s(job: AnyJob) -> float:
+        def charge(job: AnyJob) -> None:
             job.charged_step_s = self._stage_costs.of_step(job, now_s)
-            return job.charged_step_s
+            self._charge(job, job.charged_step_s)
 
-        jobs = [queue.pop(charge_s, is_allowed)]
+        jobs = [queue.pop(charge, is_allowed)]
         bucket = jobs[0].step.bucket
         limit = self._limits.get((stage.name, bucket))
         at_most = stage.max_batch if limit is None else min(stage.max_batch, limit.size)
         with suppress(IndexError):
             while len(jobs) < at_most:
-                jobs.append(queue.pop(charge_s, lambda job: job.step.bucket == bucket))
+                jobs.append(queue.pop(charge, lambda job: job.step.bucket == bucket))
         return tuple(jobs)
+
+    def _charge(self, job: AnyJob, seconds: float) -> None:
+        """Gives a job's client the computing time of its step, and all further steps together if it is one of them."""
+        self._shares.charge(job.flow, seconds)
+        if job.is_aside:
+            self._shares.charge(further(job.flow), seconds, tenant_s=0.0)
 
     def _end(self, job: AnyJob, ending: Ending, value: object, now_s: float) -> None:
         stage, queue = self._stages[job.step.stage], self._queue_of(job)

@@ -102,10 +102,10 @@ class Shares:
             group.leave(name)
             group = member
 
-    def charge(self, flow: Flow, seconds: float) -> None:
-        """Gives a client computing time; a negative one is taken back."""
-        member: _Member | None = self._all
-        for name in flow:
+    def charge(self, flow: Flow, seconds: float, tenant_s: float | None = None) -> None:
+        """Gives a client computing time, and its tenant as much or `tenant_s`; a negative one is taken back."""
+        member = self._all.charge(flow.tenant, seconds if tenant_s is None else tenant_s)
+        for name in flow[1:]:
             if member is None:
                 return
             member = member.charge(name, seconds)
