@@ -92,15 +92,15 @@ def test_better_answers_are_sent_before_the_last(setting: Setting) -> None:
 
 
 def test_a_further_attempt_is_one_row(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A rung that starts again without priors, first of all, whenever a pose has little trust."""
+    """A rung that takes epipolar lines, first of all, whenever a pose has little trust."""
     again = Rung(
         "again",
-        "nothing but the use of priors",
+        "the solver",
         Doubt.LOW_TRUST,
         "nothing",
         "structure and pose",
         "again",
-        lambda before, _: before.but(uses_priors=False),
+        lambda before, _: before.but(solver=Solver.LINES),
         lambda *_: True,
     )
     monkeypatch.setattr(ladder, "RUNGS", (again, *ladder.RUNGS))

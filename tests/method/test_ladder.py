@@ -8,7 +8,6 @@ from mapless_server.method.ladder import RUNGS, Situation, first_attempt, furthe
 from mapless_server.method.pairs.pair import Matching
 
 ALL = Situation(
-    has_priors=True,
     may_be_elsewhere=True,
     has_place=True,
     can_match_strongly=(False, True),
@@ -41,7 +40,6 @@ def climbed(doubts: Doubt, situation: Situation) -> list[str]:
         (Doubt.LOW_TRUST, Situation(can_match_strongly=(False, True)), ["stronger", "rematched"]),
         (Doubt.STARVED, Situation(reference_count=1), []),
         (Doubt.STARVED, Situation(is_best=False), []),
-        (Doubt.STARVED, Situation(has_priors=True), ["wide", "without priors", "wide", "lines"]),
         (Doubt.TWO_PLACES, Situation(has_place=True), ["one place"]),
         (Doubt.LIKE_ELSEWHERE, Situation(may_be_elsewhere=True), ["elsewhere"]),
         (
@@ -61,7 +59,7 @@ def test_the_ladder_ends(doubts: Doubt) -> None:
 
 
 def test_no_attempt_is_made_twice() -> None:
-    attempt = Attempt(1, matching=Matching.STRONG_WIDE, solver=Solver.LINES, uses_priors=False)
+    attempt = Attempt(1, matching=Matching.STRONG_WIDE, solver=Solver.LINES)
     tried = [attempt, Attempt(1)]
     for _, following in further(attempt, None, tried, ~Doubt.CAMERA, ALL):
         assert following not in tried

@@ -169,8 +169,8 @@ def whole(localize: Callable[..., Answer]) -> Method:
         return SimpleNamespace(asked=asked, context=context, bucket="stand-in", prepared=None)
 
     def solve(coarse: Any, attempt: Attempt, doubt: DoubtOptions) -> Found:
-        """Wide matches, lines and priors change nothing, so they find nothing else."""
-        if attempt.but(matching=attempt.matching.narrow, solver=Solver.POINTS, uses_priors=True) != attempt:
+        """Wide matches and lines change nothing, so they find nothing else."""
+        if attempt.but(matching=attempt.matching.narrow, solver=Solver.POINTS) != attempt:
             return found_by(attempt, Answer(Rejection(RejectionReason.LOW_OVERLAP, "planted")), doubt)
         return found_by(attempt, localize(*coarse.asked, coarse.context.check), replace(doubt, inliers=0))
 

@@ -13,7 +13,7 @@ from scipy.special import bdtrc
 from mapless_server.engine.query import QueryViews, RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
-from mapless_server.method.judge.decide import CLEARLY_MORE
+from mapless_server.method.judge.decide import PLACES
 from mapless_server.method.judge.hypothesis import Found, Hypothesis, Where
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Choice, Narrowing, Selection
@@ -85,9 +85,9 @@ def turned_to_match(search: Search, tier: Tier) -> RasterForm | Rejection:
     best = max(turned, key=lambda it: it[0])
     most, name = mirrored
     chance = bdtrc(most - 1, most + best[0], 0.5) if most else 1.0
-    if most >= CLEARLY_MORE * best[0] and chance < MIRRORED_BY_CHANCE:
+    if most >= PLACES.clearly_more * best[0] and chance < MIRRORED_BY_CHANCE:
         return _mirrored(most, best[0], name)
-    return forms[turned.index(best) if best[0] >= CLEARLY_MORE * turned[0][0] else 0]
+    return forms[turned.index(best) if best[0] >= PLACES.clearly_more * turned[0][0] else 0]
 
 
 def resembles_elsewhere(search: Search, found: Found, tier: Tier) -> bool:

@@ -169,7 +169,6 @@ class Search:
         return Situation(
             is_best=query.options.variant is Variant.BEST,
             reference_count=0 if material is None or self.coarse is None else len(material.references),
-            has_priors=bool(query.priors),
             may_be_elsewhere=can_be_elsewhere and query.narrowing.has_likely,
             has_place=place is not None and material is not None and len(place.references) < len(material.references),
             can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),

@@ -18,7 +18,6 @@ class Situation:
     Attributes:
         is_best: whether the variant of the method is the best one; the paper's has one attempt.
         reference_count: number of references that the attempt before was reconstructed with.
-        has_priors: whether there are priors.
         can_be_tracked: whether a pose prior says which references are near.
         may_be_elsewhere: whether references elsewhere would be chosen without soft priors.
         has_place: whether the priors exclude one of two places that explain the photograph.
@@ -28,7 +27,6 @@ class Situation:
 
     is_best: bool = True
     reference_count: int = 2
-    has_priors: bool = False
     can_be_tracked: bool = False
     may_be_elsewhere: bool = False
     has_place: bool = False
@@ -98,16 +96,6 @@ RUNGS = (
         "with wide matches",
         lambda before, _: before.but(matching=before.matching.widened, solver=Solver.POINTS),
         _on_points,
-    ),
-    Rung(
-        "without priors",
-        "priors take no part in the pose",
-        Doubt.STARVED | Doubt.CHANCE | Doubt.BEYOND_LIMITS | Doubt.ON_PRIOR_ALONE,
-        "priors",
-        "structure and pose",
-        "without priors",
-        lambda before, _: before.but(matching=before.matching.narrow, solver=Solver.POINTS, uses_priors=False),
-        lambda before, it: it.has_priors and _on_points(before, it),
     ),
     Rung(
         "lines",

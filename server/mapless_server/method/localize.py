@@ -4,14 +4,14 @@
 queue calls each part separately, for many photographs: see `engine.stages`, which also changes features and references.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from . import ladder
 from .bundle.priors import NO_PRIORS, Priors
 from .features.views import PosedView, View
 from .judge.answer import Answer
-from .judge.decide import decide
+from .judge.decide import Verdict, decide
 from .judge.hypothesis import Attempt, Found, Hypothesis
 from .options import DoubtOptions, LocalizeOptions, StageContext, Variant
 from .pipeline import Coarse, Pipeline, prepare, reconstruct
@@ -44,20 +44,26 @@ def localize(
 
 def refine(coarse: Coarse, doubt: DoubtOptions = DoubtOptions()) -> Answer:  # noqa: B008  frozen
     """Computes poses from a reconstruction until nothing is in doubt that another attempt could change."""
+    *_, (_, verdict) = attempts(coarse, doubt)
+    seconds = dict(coarse.prepared.context.stage_seconds)
+    return replace(verdict.chosen.answer, outcome=verdict.outcome, stage_seconds=seconds)
+
+
+def attempts(coarse: Coarse, doubt: DoubtOptions) -> Iterator[tuple[Found, Verdict]]:
+    """The attempts of a reconstruction, one after the other: each one's result, and the verdict after it."""
     prepared, attempt, found = coarse.prepared, Attempt(), list[Found]()
     priors = prepared.priors.shifted(prepared.origin)
     situation = ladder.Situation(
         is_best=prepared.options.variant is Variant.BEST,
         reference_count=len(prepared.references),
-        has_priors=bool(priors),
     )
     while True:
         found.append(solve(coarse, attempt, doubt))
         verdict = decide(found, priors, prepared.unit)
+        yield found[-1], verdict
         best = verdict.chosen.attempt if isinstance(verdict.chosen, Hypothesis) else None
         tried = [it.attempt for it in found]
         following = next(ladder.further(attempt, best, tried, verdict.doubts, situation), None)
         if following is None:
-            seconds = dict(prepared.context.stage_seconds)
-            return replace(verdict.chosen.answer, outcome=verdict.outcome, stage_seconds=seconds)
+            return
         attempt = following[1]

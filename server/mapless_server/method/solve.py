@@ -8,12 +8,11 @@ from dataclasses import replace
 from .bundle.adjust import adjust_pose, with_covariance
 from .bundle.estimate import PosedSupport, Support, with_halves
 from .bundle.pose_problem import AdjustInput
-from .bundle.priors import NO_PRIORS
 from .features.views import Reconstruction
 from .judge.answer import Answer, Localization
 from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
-from .judge.hypothesis import Attempt, Doubt, Found, Solver, found_by
+from .judge.hypothesis import Attempt, Found, Solver, found_by
 from .judge.judge import contradiction, judge
 from .judge.one_reference import one_reference_failure, trust_of_score
 from .judge.references import unmoved_failure
@@ -44,33 +43,8 @@ def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
     """
     if attempt.solver is Solver.LINES:
         return found_by(attempt, _from_lines(coarse), doubt)
-    made = coarse if attempt.uses_priors else _without_priors(coarse)
-    made = with_wide_correspondences(made) if attempt.matching.is_wide else made
-    answer = _from_points(made)
-    if not attempt.uses_priors:
-        answer = _compared(answer, coarse)
-    found = found_by(attempt, answer, doubt)
-    rests_on_priors = made.rejected_alone is not None
-    if rests_on_priors and Doubt.FEW_INLIERS in found.doubts:
-        return replace(found, doubts=found.doubts | Doubt.ON_PRIOR_ALONE)
-    return found
-
-
-def _without_priors(coarse: Coarse) -> Coarse:
-    """The result of the coarse stage without priors."""
-    free = replace(coarse, prepared=replace(coarse.prepared, priors=NO_PRIORS))
-    if alone := coarse.rejected_alone:
-        return replace(free, reconstruction=alone, scale=alone)
-    return free
-
-
-def _compared(answer: Answer, coarse: Coarse) -> Answer:
-    """Compares a pose that was computed without the priors with them."""
-    outcome, prepared = answer.outcome, coarse.prepared
-    if isinstance(outcome, Rejection) or outcome.covariance is None:
-        return answer
-    checks = prepared.priors.shifted(prepared.origin).check(outcome.world_from_camera, outcome.covariance)
-    return replace(answer, outcome=replace(outcome, prior_checks=tuple(replace(it, used=False) for it in checks)))
+    made = with_wide_correspondences(coarse) if attempt.matching.is_wide else coarse
+    return found_by(attempt, _from_points(made), doubt)
 
 
 def _from_points(coarse: Coarse) -> Answer:

@@ -18,6 +18,7 @@ MODULES = {
         "stationary-same-view-share",
     ),
     "stationary_auto": ("stationary-overlays-auto",),
+    "one_place": ("same-place", "clearly-more"),
     "fairness": ("queue-credit", "queue-lately", "queue-client-share"),
     "handshake": ("handshake",),
 }

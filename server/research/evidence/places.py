@@ -102,7 +102,7 @@ class Measured:
         """Whether there is a pose that is near enough to the truth."""
         if self.off is None or self.pair.true_pose is None or self.answer.support is None:
             return False
-        largest = RIGHT_SHARE * _distance_seen(self.answer.support, self.pair.true_pose)
+        largest = RIGHT_SHARE * distance_seen(self.answer.support, self.pair.true_pose)
         return self.off[0] <= (min(RIGHT_M, largest) if self.pair.metric else largest) and self.off[1] <= RIGHT_DEG
 
 
@@ -184,7 +184,7 @@ def _error(pair: Pair, answer: Answer) -> tuple[float, float] | None:
     return pose_error(pair.true_pose, pose) if pair.true_pose is not None else (np.inf, np.inf)
 
 
-def _distance_seen(support: Support, true_pose: RigidTransform) -> float:
+def distance_seen(support: Support, true_pose: RigidTransform) -> float:
     """Median depth of the points that are inside the photograph at its true pose; 0 without any."""
     camera, x_in_world = support.query.camera, support.structure.x_in_world
     x_in_camera = true_pose.shifted(-support.origin).inverse().apply(x_in_world)

@@ -20,7 +20,7 @@ from mapless_server.method.bundle.priors import PositionPrior, Priors
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.judge import decide as module
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.judge.decide import CLEARLY_MORE, SAME_POSITION_M, SAME_SHARE, at_one_place, decide
+from mapless_server.method.judge.decide import PLACES, at_one_place, decide
 from mapless_server.method.judge.hypothesis import (
     Attempt,
     Doubt,
@@ -130,7 +130,7 @@ class TestOnePlace:
         if share:
             made = [posed(made[0], 0.0, sigma_m=sigma_m), posed(made[1], apart_m)]
         radii = [accuracy_from_covariance(it * np.eye(6)).position_95_m for it in (sigma_m**2, 1e-4)]
-        reach_m = max(SAME_POSITION_M, sum(radii), SAME_SHARE * DISTANCE_M if share else 0.0)
+        reach_m = max(PLACES.same_position_m, sum(radii), PLACES.same_share * DISTANCE_M if share else 0.0)
         if abs(apart_m - reach_m) > 1e-6:
             first, second = map(hypothesis, made)
             assert at_one_place(first, second) is at_one_place(second, first) is (apart_m < reach_m)
@@ -167,7 +167,7 @@ class TestDecide:
     def test_of_two_places_the_clearly_better_is_answered(
         self, far: dict[str, float], inliers: int, is_answered: bool
     ) -> None:
-        assert CLEARLY_MORE == 1.5
+        assert PLACES.clearly_more == 1.5
         verdict = decide([found(accepted(inliers=30)), found(accepted(inliers=inliers, **far), STRONGER)], NONE)
         if is_answered:
             assert verdict.chosen.attempt is STRONGER

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless_server.bounds import check_bounds
 
 from ..bundle.estimate import Support, accuracy_from_covariance
 from ..bundle.priors import Priors
@@ -29,16 +30,31 @@ from .answer import Localization
 from .evidence import Votes, votes_of
 from .hypothesis import Doubt, Failed, Found, Hypothesis, Raster
 
-SAME_POSITION_M, SAME_ROTATION_DEG = 0.1, 2.0
-"""Poses closer than this are one place. Radii do not include errors of the references' poses, so they can be too small
-for this test."""
 
-SAME_SHARE = 0.05
-"""Poses closer than this share of the distance to what the photograph shows are one place: so far off a right pose may
-be."""
+@dataclass(frozen=True)
+class PlaceOptions:
+    """When poses are of one place, and when a place is clearly better than another.
 
-CLEARLY_MORE = 1.5
-"""A place is clearly better than another if its score is this many times as large."""
+    Poses of one place are no further apart than their radii together, or one of these; radii do not include errors of
+    the references' poses, so they can be too small for this test.
+
+    Attributes:
+        same_position_m, same_rotation_deg: distance and angle. Evidence: same-place.
+        same_share: distance as a share of that to what the photograph shows, since a right pose may be so far off.
+        clearly_more: a place is clearly better if its score is this many times as large. Evidence: clearly-more.
+    """
+
+    same_position_m: float = 0.1
+    same_rotation_deg: float = 2.0
+    same_share: float = 0.05
+    clearly_more: float = 1.5
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "same_position_m same_rotation_deg same_share", above=0)
+        check_bounds(self, "clearly_more", at_least=1)
+
+
+PLACES = PlaceOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,11 +85,6 @@ class _Place:
     def accepted(self) -> Sequence[Hypothesis]:
         return [it for it in self.poses if it.is_accepted]
 
-    @property
-    def stands_alone(self) -> bool:
-        """Whether it has an accepted pose to which the photograph alone leads."""
-        return any(Doubt.ON_PRIOR_ALONE not in it.doubts for it in self.accepted)
-
     def as_hypothesis(self) -> PoseHypothesis:
         best = next(iter(self.accepted), self.poses[0])
         support = best.answer.support
@@ -82,38 +93,41 @@ class _Place:
         return PoseHypothesis(best.world_from_camera, best.inlier_count, names)
 
 
-def decide(found: Sequence[Found], priors: Priors, unit: str = "m") -> Verdict:
+def decide(found: Sequence[Found], priors: Priors, unit: str = "m", options: PlaceOptions = PLACES) -> Verdict:
     """Returns the verdict after at least one attempt.
 
     Args:
         found: the attempts' results, in order; poses beyond the caller's limits are rejections that say so.
         priors: the photograph's priors, in the caller's world.
         unit: of the scene's lengths, in messages.
+        options: when poses are of one place.
     """
     failed = [it for it in found if isinstance(it, Failed)]
     if wrong := [it for it in failed if Doubt.CAMERA in it.doubts]:  # mirrored
         return Verdict(wrong[0], wrong[0].answer.outcome, Doubt.CAMERA)
     within = [it for it in found if isinstance(it, Hypothesis) and Doubt.BEYOND_LIMITS not in it.doubts]
     if not any(it.is_accepted for it in within):
-        return _rejected(found, priors)
-    rivals = _rivals(_places_of(within, found), priors)
+        return _rejected(found, priors, options)
+    rivals = _rivals(_places_of(within, found, options), priors, options)
     if len(rivals) == 1:
         return _at(rivals[0])
-    decided = place_of_priors([it.as_hypothesis() for it in rivals], [it.score for it in rivals], priors)
+    decided = place_of_priors([it.as_hypothesis() for it in rivals], [it.score for it in rivals], priors, options)
     return _at(rivals[decided]) if isinstance(decided, int) else _ambiguous(rivals, decided, unit)
 
 
-def at_one_place(first: Hypothesis, second: Hypothesis) -> bool:
+def at_one_place(first: Hypothesis, second: Hypothesis, options: PlaceOptions = PLACES) -> bool:
     """Whether two poses are of one place: no further apart than both may be off."""
     radii = [accuracy_from_covariance(it.covariance) for it in (first, second)]
-    share_m = SAME_SHARE * min(first.distance_m, second.distance_m)
-    reach_m = max(SAME_POSITION_M, share_m, sum(it.position_95_m for it in radii))
-    reach_deg = max(SAME_ROTATION_DEG, sum(it.rotation_95_deg for it in radii))
+    share_m = options.same_share * min(first.distance_m, second.distance_m)
+    reach_m = max(options.same_position_m, share_m, sum(it.position_95_m for it in radii))
+    reach_deg = max(options.same_rotation_deg, sum(it.rotation_95_deg for it in radii))
     apart_m, apart_deg = _apart(first.world_from_camera, second.world_from_camera)
     return apart_m <= reach_m and apart_deg <= reach_deg
 
 
-def place_of_priors(places: Sequence[PoseHypothesis], scores: Sequence[float], priors: Priors) -> int | Hint | None:
+def place_of_priors(
+    places: Sequence[PoseHypothesis], scores: Sequence[float], priors: Priors, options: PlaceOptions = PLACES
+) -> int | Hint | None:
     """Index of the only place that the priors do not exclude, or a hint why they do not decide; None without priors.
 
     They decide if all of them agree with one place and exclude the others, unless another has clearly more.
@@ -121,7 +135,7 @@ def place_of_priors(places: Sequence[PoseHypothesis], scores: Sequence[float], p
     if not priors:
         return None
     # Hypotheses are not refined. Their assumed error is such that two of one place still agree at two sigma.
-    sigmas = [SAME_POSITION_M / 2] * 3 + [math.radians(SAME_ROTATION_DEG) / 2] * 3
+    sigmas = [options.same_position_m / 2] * 3 + [math.radians(options.same_rotation_deg) / 2] * 3
     covariance = np.diag(np.square(sigmas))
     checks = [priors.check(it.world_from_camera, covariance) for it in places]
     left = [i for i, of_one in enumerate(checks) if not any(it.conflict for it in of_one)]
@@ -136,20 +150,20 @@ def place_of_priors(places: Sequence[PoseHypothesis], scores: Sequence[float], p
         return Hint("judge", Advice.TELL_PLACES_APART, message, best)
     if not all(it.is_likely for it in checks[left[0]]):
         return Hint("judge", Advice.CHECK_PRIOR, "Check the prior: it fits neither of the two places well.", best)
-    if max(scores) >= CLEARLY_MORE * scores[left[0]]:
+    if max(scores) >= options.clearly_more * scores[left[0]]:
         message = "Check the prior: the photograph shows more of the other place."
         return Hint("judge", Advice.CHECK_PRIOR, message, best)
     return left[0]
 
 
-def _places_of(hypotheses: Sequence[Hypothesis], found: Sequence[Found]) -> list[_Place]:
+def _places_of(hypotheses: Sequence[Hypothesis], found: Sequence[Found], options: PlaceOptions) -> list[_Place]:
     """The places of the poses, the best score first."""
     scores = _scores(hypotheses, found)
     order = sorted(range(len(hypotheses)), key=lambda i: (-scores[i], -hypotheses[i].attempt.features))
     places: list[tuple[float, list[Hypothesis]]] = []
     for i in order:
         pose = hypotheses[i]
-        near = next((poses for _, poses in places if at_one_place(poses[0], pose)), None)
+        near = next((poses for _, poses in places if at_one_place(poses[0], pose, options)), None)
         if near is None:
             places.append((scores[i], [pose]))
         else:
@@ -157,16 +171,15 @@ def _places_of(hypotheses: Sequence[Hypothesis], found: Sequence[Found]) -> list
     return [_Place(poses, score) for score, poses in places]
 
 
-def _rivals(places: Sequence[_Place], priors: Priors) -> list[_Place]:
+def _rivals(places: Sequence[_Place], priors: Priors, options: PlaceOptions) -> list[_Place]:
     """The places between which scores do not decide, the best first.
 
-    A place that contradicts the priors is never answered where an accepted pose agrees with them, and does not rest on
-    them.
+    A place that contradicts the priors is never answered where an accepted pose agrees with them.
     """
     best = places[0]
-    rivals = [it for it in places if CLEARLY_MORE * it.score > best.score or it is best]
+    rivals = [it for it in places if options.clearly_more * it.score > best.score or it is best]
     if len(rivals) == 1 and priors and _conflicts(best, priors):
-        rivals += [it for it in places[1:] if it.stands_alone and not _conflicts(it, priors)][:1]
+        rivals += [it for it in places[1:] if it.accepted and not _conflicts(it, priors)][:1]
     return rivals
 
 
@@ -239,7 +252,7 @@ def _at(place: _Place) -> Verdict:
     return Verdict(chosen, chosen.answer.outcome, reduce(and_, (it.doubts for it in counted)))
 
 
-def _rejected(found: Sequence[Found], priors: Priors) -> Verdict:
+def _rejected(found: Sequence[Found], priors: Priors, options: PlaceOptions) -> Verdict:
     """The rejection that says most, with all doubts: the strongest features' first, unless one names a cause."""
 
     def says(result: Found) -> tuple[bool, int, bool]:
@@ -255,7 +268,7 @@ def _rejected(found: Sequence[Found], priors: Priors) -> Verdict:
     if len(outcome.hypotheses) != 2 or outcome.hint is not None:
         return verdict
     counts = [float(it.inlier_count) for it in outcome.hypotheses]
-    decided = place_of_priors(outcome.hypotheses, counts, priors)
+    decided = place_of_priors(outcome.hypotheses, counts, priors, options)
     if isinstance(decided, Hint):
         return replace(verdict, outcome=replace(outcome, hint=decided))
     return verdict if decided is None else replace(verdict, place=outcome.hypotheses[decided])

@@ -57,7 +57,6 @@ class Attempt:
         where: which references are used.
         matching: how the photographs are matched.
         solver: which matches give the pose.
-        uses_priors: whether priors take part in the pose.
     """
 
     features: int = 0
@@ -66,7 +65,6 @@ class Attempt:
     where: Where = Where.LIKELY
     matching: Matching = Matching.STRICT
     solver: Solver = Solver.POINTS
-    uses_priors: bool = True
 
     @property
     def basis(self) -> "Attempt":
@@ -92,8 +90,6 @@ class Doubt(Flag):
     LOW_TRUST = auto()
     WIDE_RADIUS = auto()
     FEW_INLIERS = auto()
-    ON_PRIOR_ALONE = auto()
-    """The photograph alone gives no initial pose."""
     LIKE_ELSEWHERE = auto()
     """References elsewhere share much with the photograph that does not fit the pose."""
     CAMERA = auto()
