@@ -130,7 +130,7 @@ RUNGS = (
     Rung(
         "turned",
         "features of the photograph turned as it matches most",
-        Doubt.STARVED | Doubt.CHANCE | Doubt.LOW_TRUST,
+        Doubt.STARVED | Doubt.CHANCE,
         "first features that match only what is upright; clearly more matches turned",
         "features four times, and all that follows",
         "turned by 90, 180 and 270 degrees",

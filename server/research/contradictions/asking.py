@@ -4,6 +4,7 @@ import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def _ask(server: ChildServer, client: Client, case: Case) -> Row:
     return row | {
         "features": diagnostics.features,
         "retrieval": diagnostics.retrieval,
-        "attempts": [str(it) for it in getattr(diagnostics, "attempts", ())],
+        "attempts": [asdict(it) for it in getattr(diagnostics, "attempts", ())],
     }
 
 

@@ -92,9 +92,14 @@ def described(row: Row) -> str:
         text += f": {row['message']}"
         hypotheses = row.get("hypotheses") or ()
         text += f" ({len(hypotheses)} hypotheses)" if hypotheses else ""
-    attempts = f", attempts {'; '.join(row['attempts'])}" if row.get("attempts") else ""
+    attempts = ", attempts " + "; ".join(map(_attempt, row["attempts"])) if row.get("attempts") else ""
     tracked = ", tracked" if row.get("retrieval") == "pose-prior" else ""
     return f"{text}, {row.get('features', '-')}{tracked}, {row['processor_s']:.2f} s{attempts}"
+
+
+def _attempt(attempt: Row) -> str:
+    chosen = ", answered" if attempt["chosen"] else ""
+    return f"{attempt['rung']} with {attempt['features'].split('-')[0]}: {attempt['outcome']}{chosen}"
 
 
 def _kind_row(kind: str, pairs: Sequence[tuple[Row, Row]]) -> list[object]:

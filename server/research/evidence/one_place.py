@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from mapless.geometry import Camera
 from mapless.priors import set_priors
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.images import ImageLimits, decode_image
@@ -26,7 +27,6 @@ from mapless_server.method.pipeline import Pipeline, prepare, reconstruct
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.services.messages.queries import priors_from_message
 from mapless_server.store.records import SceneAttributes
-from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.references import choose_references
 from research.contradictions.asking import is_near
@@ -55,14 +55,16 @@ QUESTIONS = {
             "How far apart may two poses of one photograph be that count as one place? The other two bounds, 2 degrees "
             "and 5 % of the distance to what the photograph shows, are scaled with it.",
             DATA,
-            "",
+            "The values of the rules before this one. With SIFT alone the table hardly depends on them, since few "
+            "photographs have poses of two places; with EdgePoint2 and ALIKED, on 289 photographs, the rule with them "
+            "localized 186, 5 of them wrongly, where the former rules had 184 and 6.",
         ),
         Question(
             "clearly-more",
             f"{CODE}.clearly_more",
             "By which factor must the score of a place exceed that of any other to be answered?",
             DATA,
-            "",
+            "1.5, as the rules before this one. From 1.25 to 5 no photograph is answered otherwise.",
         ),
     )
 }
@@ -135,21 +137,21 @@ def _asked(scenes: Path) -> Sequence[Asked]:
     pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher("sift", 2))
 
     @cache
-    def view_of(frame: Frame) -> View:
-        return extractor.extract(decode_image(frame.image_path.read_bytes(), ImageLimits()), frame.camera)
+    def view_of(image: Path, camera: Camera) -> View:
+        return extractor.extract(decode_image(image.read_bytes(), ImageLimits()), camera)
 
     @cache
     def references_of(place: Place) -> list[PosedView]:
         return [
-            PosedView(
-                it.reference_id, f"{place.scene}/{it.reference_id}", view_of(frames[it.image]), it.world_from_camera
-            )
+            PosedView(it.reference_id, it.reference_id, view_of(Path(str(it.image)), it.camera), it.world_from_camera)
             for it in place.references()
         ]
 
     asked = list[Asked]()
     for kind in ASKED:
         for case in KINDS[kind](of):
+            if "limit" in case.name:
+                continue
             query = extractor.extract(decode_image(case.image(), ImageLimits()), case.camera)
             every = references_of(case.place)
             chosen = choose_references(query, every, REFERENCES, ratio=OPTIONS["sift"].query_ratio)
@@ -167,7 +169,7 @@ def _asked(scenes: Path) -> Sequence[Asked]:
 
 
 def _method_priors(case: Case) -> Priors:
-    """The priors of a case as the method takes them; hard limits, which choose references, are left out."""
+    """The priors of a case as the method takes them."""
     if case.priors is None:
         return NO_PRIORS
     request = pb.LocalizeRequest()
