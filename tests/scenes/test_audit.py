@@ -9,9 +9,8 @@ from support.scenes import SceneOptions, SyntheticScene, look_at, make_scene
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.features.views import Features, PosedView
-from mapless_server.method.judge.judge import JudgeOptions
+from mapless_server.method.judge import judge
 from mapless_server.scenes import AuditVerdict, Coverage, CoverageVerdict, ReferenceAudit
-from mapless_server.scenes.audit import comparison
 from mapless_server.scenes.audit.coverage import REPEATABILITY, check_coverage
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.resection import with_focal
@@ -111,7 +110,7 @@ def test_a_pose_that_looks_away_has_no_error_in_pixels(references: list[PosedVie
 def test_a_pose_that_no_answer_would_have_accuses_nothing(
     references: list[PosedView], pairs: PairMatches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(comparison, "JudgeOptions", lambda: JudgeOptions(max_radius_share=1e-9))
+    monkeypatch.setattr(judge, "MAX_RADIUS_SHARE", 1e-9)
     scene = altered(references, VICTIM, moved(references[VICTIM], (0.4, -0.3, 0.2)))
     found = only_fault(audit(scene, pairs), VICTIM)
     assert found.verdict is AuditVerdict.UNVERIFIABLE

@@ -13,8 +13,7 @@ from .judge.answer import Answer, Localization
 from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
 from .judge.hypothesis import Attempt, Found, Solver, found_by
-from .judge.judge import contradiction, judge
-from .judge.one_reference import one_reference_failure, trust_of_score
+from .judge.judge import contradiction, judge, one_reference_failure, trust_of_score
 from .judge.references import unmoved_failure
 from .judge.two_view import (
     lacks_distance,

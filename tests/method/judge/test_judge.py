@@ -12,6 +12,7 @@ from mapless.geometry import RigidTransform
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, Support
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge import evidence as halves_of
+from mapless_server.method.judge import judge as judging
 from mapless_server.method.judge.evidence import (
     NO_AGREEMENT,
     Evidence,
@@ -27,7 +28,7 @@ from mapless_server.method.judge.evidence import (
 from mapless_server.method.judge.judge import JudgeOptions, judge, trust_of
 from mapless_server.method.optim.optimize import pose_jacobian
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pose.pnp import PnpOptions, solve_pose
+from mapless_server.method.pose.pnp import LOSS_SCALE_PX, PnpOptions, solve_pose
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 
 OPTIONS = JudgeOptions()
@@ -213,16 +214,14 @@ def test_degenerate_evidence_has_a_finite_score() -> None:
     assert trust_of(worst, OPTIONS) < 1 - COVERAGE
 
 
-def test_agreement_with_gravity_only_adds_to_the_trust() -> None:
+def test_agreement_with_gravity_only_adds_to_the_trust(monkeypatch: pytest.MonkeyPatch) -> None:
     """As much as its chance is small, and less than if nothing but chance made poses wrong."""
     doubtful = Evidence(40, 60, 0.2, 0.5, 0.2, 0.3, 0.02, 0.03)
     trusts = [trust_of(doubtful, OPTIONS, log10_chance) for log10_chance in (0.0, -1.0, -3.0)]
     assert trusts[0] == trust_of(doubtful, OPTIONS)
     assert trusts[0] < trusts[1] < trusts[2]
-    all_of_it = replace(OPTIONS, agreement_weight=1.0)
-    assert trust_of(doubtful, all_of_it, -3.0) > trusts[2]
-    with pytest.raises(ValueError, match="must be"):
-        replace(OPTIONS, agreement_weight=-0.1)
+    monkeypatch.setattr(judging, "AGREEMENT_WEIGHT", 1.0)
+    assert trust_of(doubtful, OPTIONS, -3.0) > trusts[2]
 
 
 def test_hull_share_of_a_rectangle_is_its_area() -> None:
@@ -282,7 +281,7 @@ def test_halves_move_by_the_steps_of_each_alone() -> None:
         for _ in range(halves_of.LINEAR_STEPS):
             hessian, gradient = np.zeros((6, 6)), np.zeros(6)
             for slope, error in zip(jacobian[half], (residual + jacobian @ motion)[half], strict=True):
-                weight = 1 / (1 + error @ error / halves_of.LOSS_SCALE_PX**2)
+                weight = 1 / (1 + error @ error / LOSS_SCALE_PX**2)
                 hessian += weight * slope.T @ slope
                 gradient += weight * slope.T @ error
             motion = motion - np.linalg.solve(hessian, gradient)

@@ -16,7 +16,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from ..bundle.priors import NO_PRIORS, Priors
 from ..features.views import PosedView, ReconstructedView, Reconstruction, View, map_cells
 from ..pairs.correspond import Correspondences
-from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, MIN_MATCHES, PnpOptions, format_false_alarms, log10_false_alarms, ransac
+from ..pose.pnp import MIN_MATCHES, PnpOptions, gate_failure, ransac
 from ..pose.with_priors import informed_pose
 from ..rejection import Rejection, RejectionReason
 from ..structure.kept_depth import with_kept_depths
@@ -103,18 +103,15 @@ class GeometricReconstructor:
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
     ) -> tuple[Rejection | None, NDArray[np.bool_]]:
         """Returns the reason to reject the pose, if any, and which of the matches (M,) are its inliers."""
-        inliers = np.zeros(len(matches), bool)
-        message = f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
+        inliers, named = np.zeros(len(matches), bool), "matches with the references' points"
+        failure: str | None = (
+            f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
+        )
         if pose is not None:
             inliers = matches.seen(query, structure.x_in_world).errors_px(pose) < PNP.inlier_px
-            expected = log10_false_alarms(query.camera, matches, inliers, PNP.inlier_px) + priors.log10_chance(pose)
-            if expected <= MAX_LOG10_FALSE_ALARMS:
-                return None, inliers
-            message = (
-                f"{inliers.sum()} of {len(matches)} matches with the references' points agree on a pose, which chance"
-                f" could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
-            )
-        return Rejection(RejectionReason.LOW_OVERLAP, message, tried=len(matches)), inliers
+            chance = priors.log10_chance(pose)
+            failure = gate_failure(query.camera, matches, inliers, PNP.inlier_px, chance, named=named)
+        return Rejection(RejectionReason.LOW_OVERLAP, failure, tried=len(matches)) if failure else None, inliers
 
 
 def _check(references: Sequence[PosedView]) -> Rejection | None:

@@ -160,20 +160,17 @@ class NetworkReconstructor:
     def _encode(self, scene: _Scene, encoded: dict[TokenKey, Tensor]) -> tuple[Tensor, ...]:
         """Returns the tokens (T, C) of each of a scene's views, and adds those of views that are not in `encoded`."""
         keys = [self._key(view) for view in scene.views]
-        for key, view in zip(keys[:-1], scene.views, strict=False):
-            if key not in encoded:
-                encoded[key] = self._encode_reference(key, view)
-        if keys[-1] not in encoded:
-            encoded[keys[-1]] = self._encode_view(scene.views[-1])
+        for key, view in zip(keys, scene.views, strict=True):
+            if key in encoded:
+                continue
+            is_query = view is scene.views[-1]
+            tokens = None if is_query else self.cache.get(key)
+            if tokens is None:
+                tokens = self._encode_view(view)
+                if not is_query:
+                    self.cache.put(key, tokens)
+            encoded[key] = tokens
         return tuple(encoded[key] for key in keys)
-
-    def _encode_reference(self, key: TokenKey, view: _LaidOut) -> Tensor:
-        """The tokens (T, C) of a reference from the cache, or computed and cached for later queries."""
-        tokens = self.cache.get(key)
-        if tokens is None:
-            tokens = self._encode_view(view)
-            self.cache.put(key, tokens)
-        return tokens
 
     def _encode_view(self, view: _LaidOut) -> Tensor:
         """Computes the tokens (T, C) of a view."""

@@ -5,7 +5,8 @@ depend on, so an entry is never stale.
 """
 
 import threading
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -19,14 +20,9 @@ from .grids import Grid
 
 @dataclass(frozen=True)
 class TokenKey:
-    """Everything that the tokens of a view depend on.
+    """Everything that the tokens of a view depend on: computation, encoded photograph and its camera, and picture.
 
-    Attributes:
-        network, weights_sha256, dtype: of the computation.
-        image_sha256: of the encoded photograph.
-        source: the photograph's camera, from which its undistortion follows.
-        grid: size of the picture.
-        camera: the picture's camera, for a network that takes intrinsics; None if it is not given to the network.
+    `camera` is the picture's, for a network that takes intrinsics; None if it is not given to the network.
     """
 
     network: str
@@ -77,27 +73,27 @@ class TokenCache:
         self._on_device: LruCache[Tensor] = LruCache(options.device_bytes)
         self._on_host: LruCache[Tensor] = LruCache(options.host_bytes)
         self._host_bytes = options.host_bytes
-        self._counters = TokenCacheCounters()
+        self._counts: Counter[str] = Counter()
         self._lock = threading.Lock()
 
     @property
     def counters(self) -> TokenCacheCounters:
         """Returns a snapshot of the counters."""
         with self._lock:
-            return replace(self._counters, device_bytes=self._on_device.used, host_bytes=self._on_host.used)
+            return TokenCacheCounters(**self._counts, device_bytes=self._on_device.used, host_bytes=self._on_host.used)
 
     def get(self, key: TokenKey) -> Tensor | None:
         """Returns the tokens (T, C) on the device, or None if they are not cached; they must not be modified."""
         with self._lock:
             tokens = self._on_device.get(key)
             if tokens is not None:
-                self._counters = replace(self._counters, device_hits=self._counters.device_hits + 1)
+                self._counts["device_hits"] += 1
                 return tokens
             spilled = self._on_host.get(key)
             if spilled is None:
-                self._counters = replace(self._counters, misses=self._counters.misses + 1)
+                self._counts["misses"] += 1
                 return None
-            self._counters = replace(self._counters, host_hits=self._counters.host_hits + 1)
+            self._counts["host_hits"] += 1
             tokens = spilled.to(self._device, non_blocking=True)
             self._hold(key, tokens)
             return tokens
@@ -126,4 +122,4 @@ class TokenCache:
             # Not waited for: it is only read by a copy to the device, which the device does after this one.
             copied = spilled.copy_(tokens, non_blocking=self._pins)
             dropped = len(self._on_host.put(key, copied, copied.nbytes))
-        self._counters = replace(self._counters, evictions=self._counters.evictions + dropped)
+        self._counts["evictions"] += dropped

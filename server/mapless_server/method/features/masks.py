@@ -17,13 +17,7 @@ MARGIN_PX = 4.0
 
 
 def usable_pixels(ignored: Ignored, width_px: int, height_px: int) -> NDArray[np.bool_]:
-    """Pixels (height, width) of a reduced image that are further than MARGIN_PX from every ignored pixel.
-
-    Args:
-        ignored: (H, W), of the image at any size.
-        width_px: of the reduced image.
-        height_px: of the reduced image.
-    """
+    """Pixels (height, width) of a reduced image further than MARGIN_PX from all that are ignored, at any size."""
     shares = cv2.resize(ignored.astype(np.float32), (width_px, height_px), interpolation=cv2.INTER_AREA)
     clear = np.asarray(shares <= 0, np.uint8)  # a pixel that is ignored in part is ignored
     if clear.all():

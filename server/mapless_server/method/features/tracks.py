@@ -30,6 +30,12 @@ class Tracks:
     view: NDArray[np.intp]
     keypoint: NDArray[np.intp]
 
+    @staticmethod
+    def in_order(point: NDArray[np.intp], view: NDArray[np.intp], keypoint: NDArray[np.intp]) -> Tracks:
+        """Sorts observations (O,) given in any order."""
+        order = np.lexsort((view, point))
+        return Tracks(point[order], view[order], keypoint[order])
+
     @property
     def point_count(self) -> int:
         """Number of points."""

@@ -250,9 +250,7 @@ class ReconstructedView:
     def depth_at(self, pixels: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:
         """Depth (N,) at pixels (N, 2) of the view's camera, nearest neighbour; NaN where unknown."""
         rows, columns, inside = map_cells(self.camera, pixels, camera)
-        depth = np.full(len(pixels), np.nan)
-        depth[inside] = self.point_map[rows[inside], columns[inside], 2]
-        return depth
+        return np.where(inside, self.point_map[rows, columns, 2].astype(np.float64), np.nan)
 
 
 def map_cells(

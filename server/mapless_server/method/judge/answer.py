@@ -20,7 +20,7 @@ class Localization:
     Attributes:
         world_from_camera: metric.
         covariance: (6, 6), order x y z rx ry rz, fixed world axes, metres and radians; None for a pose without
-            refinement, by request (`Variant.COARSE`) or for lack of time (`PoseStage.COARSE`).
+            refinement.
         pose_stage: the stage that gave the pose.
         inlier_count: number of 2D-3D matches that are inliers; of two-view matches too, if the pose rests on them.
         match_count: number of all these matches.

@@ -1,19 +1,16 @@
-"""Comparison of a photograph's camera with others, by the score of all its matches.
-
-Intrinsics of another image, half or double the focal length, or a wide lens whose distortion is left out, are too far
-off for the linear check (`intrinsics`): a pose then fits a part of the matches, at similar depths or near the centre,
-and these alone do not contradict it. But with a camera that is nearer to the true one far more of all matches agree
-with one pose. So poses are computed with other focal lengths, with other values of k1 and without the lens, and, where
-these are unusual, with the principal point in the centre and with square pixels; the score of `pose.relative` compares
-them, by points and by matches without points together. That costs a query nothing of which the linear check is certain.
-
-Checks of a photograph's intrinsics against its matches.
+"""Checks of a photograph's intrinsics against its matches: a linear one, and the comparison with other cameras.
 
 Cropped, resized and undistorted photographs often come with the intrinsics of another image. The pose is then off, with
 small residuals: its motion absorbs most of such an error. What it does not absorb is in the normal equations of the
-adjustment (see `intrinsics`), with standard deviations that contain errors of points and reference poses. A parameter
-that is off by more than the prior and these standard deviations allow together is a reason to reject the pose, although
-it was estimated with the photograph's value: the camera's next photograph will have the same error.
+adjustment (see `bundle.intrinsics`). A parameter that is off by more than the prior and its standard deviation allow
+together is a reason to reject the pose, although it was estimated with the photograph's value: the camera's next
+photograph will have the same error.
+
+Half or double the focal length, or a wide lens whose distortion is left out, are too far off for that: a pose then fits
+a part of the matches, at similar depths or near the centre, and these do not contradict it. But far more of all matches
+agree with one pose of a camera that is nearer to the true one. So poses are computed with other focal lengths, other
+values of k1, without the lens, and, where these are unusual, with the principal point in the centre and with square
+pixels; the score of `pose.relative` compares them, by points and by matches without points together.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,25 +35,23 @@ from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Reje
 def intrinsics_checks(evidence: IntrinsicsEvidence, options: ContradictionOptions) -> tuple[IntrinsicsCheck, ...]:
     """The checks of all parameters, in pixels of the photograph as it was sent."""
     sent, scale = evidence.sent, evidence.sent.width_px / evidence.given.width_px
-    k1 = sent.distortion.k1 if sent.distortion else 0.0
-    given = np.array([sent.focal_x_px, sent.principal_x_px, sent.principal_y_px, k1])
+    given = _parameters(sent)
     unit = np.array([sent.focal_x_px, scale, scale, 1.0])
     change = unit * evidence.value
     change[0] = sent.focal_x_px * np.expm1(evidence.value[0])
     estimated, sigma, given_sigma = given + change, unit * evidence.sigma, unit * evidence.prior_sigma
     conflict, used = evidence.contradicted(options, evidence.prior_sigma), evidence.removed != 0
+    columns = zip(given, estimated, sigma, given_sigma, strict=True)
     return tuple(
-        IntrinsicsCheck(
-            parameter,
-            given=float(given[i]),
-            estimated=float(estimated[i]),
-            estimated_sigma=float(sigma[i]),
-            given_sigma=float(given_sigma[i]),
-            conflict=bool(conflict[i]),
-            used=bool(used[i]),
-        )
-        for i, parameter in enumerate(IntrinsicsParameter)
+        IntrinsicsCheck(parameter, *map(float, values), conflict=bool(conflict[i]), used=bool(used[i]))
+        for i, (parameter, values) in enumerate(zip(IntrinsicsParameter, columns, strict=True))
     )
+
+
+def _parameters(camera: Camera) -> Array:
+    """The values (4,) of a camera's checked parameters."""
+    k1 = camera.distortion.k1 if camera.distortion else 0.0
+    return np.array([camera.focal_x_px, camera.principal_x_px, camera.principal_y_px, k1])
 
 
 def wrong_intrinsics(
@@ -112,48 +107,39 @@ def advice_for(lens: Distortion | None, wrong: Sequence[IntrinsicsCheck]) -> str
     )
 
 
-DOUBTED_SIGMAS = 3.0
-"""Other cameras are tried if the linear check finds a parameter off by more standard deviations,"""
-
-UNDETERMINED_FOCAL, UNDETERMINED_K1 = 0.02, 0.05
-"""or leaves the focal length (as a share) or k1 more uncertain: with K of an image of twice the size all poses are
-doubted, and so are those of a wide lens given without its distortion with which few of the matches agree."""
+DOUBTED_SIGMAS, UNDETERMINED_FOCAL, UNDETERMINED_K1 = 3.0, 0.02, 0.05
+"""Other cameras are tried if the linear check finds a parameter off by more standard deviations, or leaves the focal
+length (as a share) or k1 more uncertain than this."""
 
 MIN_GAIN, MANY_MATCHES, LARGE_SHARE, MIN_GAIN_ELSE = 1.1, 100, 0.45, 1.2
 """The camera is wrong if a pose of another one scores this many times as high, where there are many matches with points
-and no large share of them agrees with the pose; else if it scores 1.2 times as high. Of 274 right answers of 24 places
-38 are compared: one has 1.15, with 42 matches, the others up to 1.03. A pose that a large share agrees with is as right
-as its radii say, though its camera be a little wrong: eight photographs of the statue, which is given one focal length
-for all, have 1.1 to 1.2, seven with errors of 1 to 3 % of the distance."""
+and no large share of them agrees with the pose; else if it scores 1.2 times as high. A pose that a large share agrees
+with is as right as its radii say, though its camera be a little wrong."""
 
 CLEAR_GAIN = 2.0
-"""From here on that of a pose with too little evidence is evidence against its camera, too. Wrong poses of right
-cameras have up to 1.6; with intrinsics of an image of twice the size 28 of 34 have more than this."""
+"""From here on that of a pose with too little evidence is evidence against its camera, too."""
 
 MIN_MATCHES, MAX_LINES = 20, 1500
-"""Fewer matches with points say nothing. Where there are more matches with references, every other keypoint, or fewer,
-is compared: so many suffice."""
+"""Fewer matches with points do not decide. Of more matches with references, every second keypoint, or fewer, is
+compared."""
 
 UNUSUAL_PRINCIPAL_SHARE, UNUSUAL_ASPECT = 0.1, 0.03
 """Distance of the principal point from the centre, as a share of the width, from which the centre is tried too; share
 by which both focal lengths differ, from which square pixels are tried too."""
 
 PNP = PnpOptions(min_iterations=30, max_iterations=300, max_matches=300)
-"""Of the poses by points. Few matches suffice to compare cameras."""
+"""RANSAC of the poses by points. Few matches suffice to compare cameras."""
 
 LINES = RelativePoseOptions(min_iterations=50, max_iterations=150, pair_iterations=200, strongest=1)
-"""Of the poses where the given one rests on matches without points; brief, 20 to 40 ms a camera."""
+"""The search where the given pose rests on matches without points; brief, 20 to 40 ms a camera."""
 
 
 @dataclass(frozen=True)
 class _Steps:
-    """Which other cameras are tried.
+    """Which other cameras are tried: so many focal lengths, and values of k1 (`lens`), on either side of those given.
 
-    Attributes:
-        focal: how many focal lengths below the given one, and above.
-        per_octave: how many from one to its double.
-        lens: how many values of k1 below the given one, and above.
-        bend: by how much one of them moves the image's corner, as a share of its distance from the principal point.
+    There are `per_octave` focal lengths from one to its double. A value of k1 moves the image's corner by `bend`, a
+    share of its distance from the principal point, against the next.
     """
 
     focal: int
@@ -213,7 +199,7 @@ class _Compared:
         """A camera with its score, comparable with that of the given camera's pose."""
         query = self.support.query
         value = self.score_of(read_as(self.thinned(query), camera))
-        # Without points a right camera has up to 0.98 of its score with another lens, 0.92 with another focal length.
+        # Without points a wrong lens can reach the right camera's score more nearly than a wrong focal length.
         is_bent = self.support.two_view is not None and camera.distortion != query.distortion
         return value / MIN_GAIN if is_bent else value, camera
 
@@ -222,9 +208,8 @@ def wrong_camera(support: PosedSupport, best_reference: str, is_doubted: bool = 
     """A rejection that names what is wrong and the better value, if a pose of another camera scores clearly higher.
 
     A pose that rests on matches without points is compared whatever the linear check says, with few cameras by a brief
-    search: these score 0.67 to 0.90 of the pose where the given camera is right, and 1.07 to 1.44 where its intrinsics
-    are those of an image of half or twice the size. What speaks against the camera of a pose that is doubted for lack
-    of evidence is named, but without the checks that keep stronger features from being tried, unless it is very clear.
+    search. For a pose that is doubted for lack of evidence the rejection has no checks, which would keep stronger
+    features from being tried, unless it is very clear.
     """
     query, evidence, by_lines = support.query, support.estimate.intrinsics, support.two_view is not None
     count = int((~support.matches.guided).sum())
@@ -318,17 +303,16 @@ def _bend(camera: Camera) -> float:
 
 
 def _checks(sent: Camera, prior_sigma: Array, given: Camera, found: Camera, steps: _Steps) -> Iterator[IntrinsicsCheck]:
-    """What differs, in pixels of the photograph as it was sent; standard deviations are those of the steps tried."""
+    """The parameters that differ, in pixels of the photograph as sent; standard deviations are those of the steps."""
     scale, uniform = sent.width_px / found.width_px, 1 / np.sqrt(12)
-    k1, focal_px, centre_sigma_px = sent.distortion.k1 if sent.distortion else 0.0, sent.focal_x_px, sent.width_px / 20
-    of_sent = np.array([focal_px, sent.principal_x_px, sent.principal_y_px, k1])
+    of_sent, centre_sigma_px = _parameters(sent), sent.width_px / 20
     before, after = (
         np.array([it.focal_x_px, it.principal_x_px, it.principal_y_px, _bend(it)]) for it in (given, found)
     )
     focal_sigma_px = scale * found.focal_x_px * np.log(2) / steps.per_octave * uniform
     sigma = np.array([focal_sigma_px, centre_sigma_px, centre_sigma_px, _k1_step(given, steps) * uniform])
     estimated = of_sent + np.array([scale, scale, scale, 1.0]) * (after - before)
-    given_sigma = np.array([focal_px, scale, scale, 1.0]) * prior_sigma
+    given_sigma = np.array([sent.focal_x_px, scale, scale, 1.0]) * prior_sigma
     differs = after != before
     for i, parameter in enumerate(IntrinsicsParameter):
         if differs[i]:

@@ -26,7 +26,6 @@ _STAGES = {
     RejectionReason.PRIOR_CONFLICT: "judge",
 }
 
-
 FEW_FEATURES = 200
 """A photograph with fewer is dark, blurred or shows nothing; sharp ones have 500 to 2048."""
 
@@ -36,7 +35,6 @@ FEW_MATCHES = 30
 MANY_MATCHES = 100
 """So many with one reference are not chance; if they have no common pose, intrinsics or poses are wrong."""
 
-
 MUCH_IGNORED = 0.5
 """Share of a photograph that masks seldom ignore: vehicles, grippers and people take less, inverted ones more."""
 
@@ -45,16 +43,8 @@ MUCH_IGNORED = 0.5
 class _Case:
     """The numbers that a hint follows from.
 
-    Attributes:
-        rejection: the query's rejection.
-        features: number of features of the photograph.
-        matches: number of matches with the best reference.
-        second: number of matches with the second best reference.
-        inliers: number of inliers among all 2D-3D matches.
-        tried: number of 2D-3D matches; None if there are none yet.
-        best: name of the reference with most matches; None if none has any.
-        reference_count: number of references used.
-        has_prior: whether the request has a prior.
+    `matches` and `second` are with the two references with most matches, of which `best` is the name of the first;
+    `tried` are those with points, None if there are none yet, and `inliers` those of them that agree.
     """
 
     rejection: Rejection

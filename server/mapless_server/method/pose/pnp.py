@@ -206,16 +206,17 @@ def gate_failure(
     inliers: NDArray[np.bool_],
     inlier_px: float,
     log10_chance: float = 0.0,
+    named: str = "matches",
 ) -> str | None:
     """Says in one sentence why a pose fails the gate; None if it passes.
 
     At least four of the matches with points are `inliers` (M,) of the pose, with errors up to `inlier_px`. For
-    `log10_chance` see `Priors.log10_chance`.
+    `log10_chance` see `Priors.log10_chance`; the sentence has the matches `named` so.
     """
     expected = log10_false_alarms(camera, matches, inliers, inlier_px) + log10_chance
     if expected <= MAX_LOG10_FALSE_ALARMS:
         return None
-    count = f"{inliers.sum()} of {len(matches)} matches agree on a pose"
+    count = f"{inliers.sum()} of {len(matches)} {named} agree on a pose"
     return f"{count}, which chance could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
 
 

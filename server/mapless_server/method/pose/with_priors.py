@@ -187,17 +187,22 @@ def ransac_with_gravity(
     seen = seen[:: -(-len(seen) // MAX_MATCHES)]
     # An angle error in pixels; a shift of the camera compensates half of it.
     wide_px = math.hypot(inlier_px, 0.5 * seen.camera.focal_x_px * min(gravity.sigma, 0.1))
-    hypotheses = _Hypotheses(seen, wide_px)
     rng = np.random.default_rng(0)
     rays = seen.camera.rays(seen.pixels)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    drawn, wanted = 0, float(MAX_SAMPLES)
-    while drawn < min(wanted, MAX_SAMPLES):
-        hypotheses.add(*solve_pairs(gravity, rays, seen.x_in_world, _pairs(rng, len(seen), BATCH)))
+    best, costs, inlier_share, drawn = np.zeros((0, 3, 4)), np.zeros(0), 0.0, 0
+    while drawn < min(_samples_needed(inlier_share), MAX_SAMPLES):
+        rotation, translation = solve_pairs(gravity, rays, seen.x_in_world, _pairs(rng, len(seen), BATCH))
         drawn += BATCH
-        wanted = _samples_needed(hypotheses.inlier_share)
+        squared = _squared_errors(seen, rotation, translation)
+        inlier = squared < wide_px**2
+        inlier_share = float(inlier.mean(axis=1).max(initial=inlier_share))
+        costs = np.append(costs, np.where(inlier, squared, wide_px**2).sum(axis=1))
+        best = np.concatenate([best, np.concatenate([rotation, translation[:, :, None]], axis=2)])
+        order = np.argsort(costs, kind="stable")[:REFINED]
+        best, costs = best[order], costs[order]
+    poses = [RigidTransform(pose[:, :3], pose[:, 3]).inverse() for pose in best]
     # Refined first with a loss as wide as gravity's error, then with a narrow one.
-    poses = hypotheses.best()
     for scale_px in (max(wide_px / 2, LOSS_SCALE_PX), LOSS_SCALE_PX):
         poses = [refine_pose(seen, pose, priors, scale_px) for pose in poses]
     return poses
@@ -243,33 +248,10 @@ def _samples_needed(inlier_share: float) -> float:
     return math.log(1 - CONFIDENCE) / math.log(missed) if 0 < missed < 1 else (math.inf if missed >= 1 else 1.0)
 
 
-class _Hypotheses:
-    """The best poses camera_from_world, by the truncated sum of their squared errors."""
-
-    def __init__(self, seen: PixelPoints, tolerance_px: float) -> None:
-        self._focal = np.array([seen.camera.focal_x_px, seen.camera.focal_y_px])
-        self._ideal = seen.camera.rays(seen.pixels)[:, :2]
-        self._x_in_world, self._tolerance_px = seen.x_in_world, tolerance_px
-        self._costs, self._poses = np.zeros(0), np.zeros((0, 3, 4))
-        self.inlier_share = 0.0
-
-    def add(self, rotation: Array, translation: Array) -> None:
-        """Scores poses with rotations (H, 3, 3) and translations (H, 3), and keeps the best."""
-        if not len(rotation):
-            return
-        x, y, z = np.moveaxis(rotation @ self._x_in_world.T + translation[:, :, None], 1, 0)  # (H, N) each
-        depth = np.where(z > 0, z, np.nan)
-        squared = ((x / depth - self._ideal[:, 0]) * self._focal[0]) ** 2
-        squared += ((y / depth - self._ideal[:, 1]) * self._focal[1]) ** 2
-        limit = self._tolerance_px**2
-        inlier = squared < limit
-        costs = np.where(inlier, squared, limit).sum(axis=1)
-        self.inlier_share = max(self.inlier_share, float(inlier.mean(axis=1).max()))
-        poses = np.concatenate([rotation, translation[:, :, None]], axis=2)
-        self._costs, self._poses = np.append(self._costs, costs), np.concatenate([self._poses, poses])
-        order = np.argsort(self._costs, kind="stable")[:REFINED]
-        self._costs, self._poses = self._costs[order], self._poses[order]
-
-    def best(self) -> list[RigidTransform]:
-        """Returns world_from_camera of the best hypotheses, the best first."""
-        return [RigidTransform(pose[:, :3], pose[:, 3]).inverse() for pose in self._poses]
+def _squared_errors(seen: PixelPoints, rotation: Array, translation: Array) -> Array:
+    """Squared errors (H, N) of poses camera_from_world (H, 3, 3) and (H, 3), square pixels; NaN behind the camera."""
+    x, y, z = np.moveaxis(rotation @ seen.x_in_world.T + translation[:, :, None], 1, 0)  # (H, N) each
+    depth, ideal = np.where(z > 0, z, np.nan), seen.camera.rays(seen.pixels)
+    squared = ((x / depth - ideal[:, 0]) * seen.camera.focal_x_px) ** 2
+    squared += ((y / depth - ideal[:, 1]) * seen.camera.focal_y_px) ** 2
+    return np.asarray(squared)

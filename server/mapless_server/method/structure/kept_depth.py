@@ -6,12 +6,12 @@ d and relative standard deviation s, of a camera at C with the viewing direction
     z . (x - C) = d,    with the standard deviation    s d.
 
 A reference's keypoint that only the query matches becomes a point at its depth, which one reference observes. Its error
-is along the ray, so it moves the photograph's keypoint along the epipolar line; the final adjustment knows that, since
-it keeps the planes (see `bundle`). Where the photograph matches mostly triangulated points, these alone are used.
+is along the ray; the final adjustment keeps the planes (see `bundle`). Where the photograph matches mostly triangulated
+points, these alone are used.
 
-A network's errors are shared by all depths of a photograph, so that they do not average out. What they share is seen at
-the keypoints of triangulated points: the most probable common factor is removed, by the variances of depths and points,
-with Cauchy's loss and a prior of standard deviation s. Points that are triangulated stay where they are.
+A network's errors are shared by all depths of a photograph. What they share is seen at the keypoints of triangulated
+points: the most probable common factor is removed, by the variances of depths and points, with Cauchy's loss and a
+prior of standard deviation s. Points that are triangulated stay where they are.
 """
 
 from collections.abc import Sequence
@@ -33,11 +33,10 @@ from .structure import observe
 
 MIN_ADDED_SHARE = 0.4
 """Points at stored depths are added where there are so many for each match with a triangulated point; as
-`AdjustOptions.min_added_share`. In `euroc-v101-drone` with five references and over a thousand matches, they would make
-errors a fifth larger."""
+`AdjustOptions.min_added_share`."""
 
 LOSS_SCALE_SIGMA = 2.0
-"""Of the Cauchy loss for common factors: depths are wrong at edges, and of what is reflected."""
+"""Scale of the Cauchy loss for common factors: depths are wrong at edges, and of what is reflected."""
 
 ITERATIONS = 6
 """Steps to a common factor, by reweighted least squares."""
@@ -140,6 +139,5 @@ def _with_single(structure: Structure, known: _KnownDepths, rows: NDArray[np.int
     view = np.searchsorted(known.offsets, rows, side="right") - 1
     points = known.centre[rows] + known.ray[rows] * known.depth[rows, None]
     single = Tracks(np.arange(len(rows)), view, rows - known.offsets[view])
-    count = len(structure.x_in_world)
-    none = DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
-    return replace(structure, planes=none).and_last(points, single, known.planes(rows))
+    unknown = DepthPlanes.unknown(len(structure.x_in_world))
+    return replace(structure, planes=unknown).and_last(points, single, known.planes(rows))

@@ -82,6 +82,11 @@ class DepthPlanes:
     def __getitem__(self, points: NDArray[np.bool_] | NDArray[np.intp]) -> DepthPlanes:
         return DepthPlanes(self.normal[points], self.offset[points], self.information[points])
 
+    @staticmethod
+    def unknown(count: int) -> DepthPlanes:
+        """Planes of points that are near none."""
+        return DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+
     def and_last(self, others: DepthPlanes) -> DepthPlanes:
         """Appends the planes of further points."""
         pairs = ((getattr(self, name), getattr(others, name)) for name in ("normal", "offset", "information"))
@@ -136,22 +141,18 @@ class Structure:
         tracks, view = self.tracks, np.asarray(order, np.intp)[self.tracks.view]
         keypoint = view * (tracks.keypoint.max() + 1) + tracks.keypoint  # counted through all references
         points = np.argsort(np.minimum.reduceat(keypoint, tracks.starts))
-        point = np.argsort(points)[tracks.point]
-        rows = np.argsort(point * len(order) + view)
-        moved = Tracks(point[rows], view[rows], tracks.keypoint[rows])
+        moved = Tracks.in_order(np.argsort(points)[tracks.point], view, tracks.keypoint)
         return Structure(self.x_in_world[points] + offset, moved, self.noise)
 
     def and_last(self, x_in_world: Array, tracks: Tracks, planes: DepthPlanes | None = None) -> Structure:
         """Appends points (Q, 3) with their tracks; without `planes`, none of these is near a plane."""
-        count, added = len(self.x_in_world), len(x_in_world)
         both = Tracks(
-            np.concatenate([self.tracks.point, count + tracks.point]),
+            np.concatenate([self.tracks.point, len(self.x_in_world) + tracks.point]),
             np.concatenate([self.tracks.view, tracks.view]),
             np.concatenate([self.tracks.keypoint, tracks.keypoint]),
         )
         if self.planes is not None:
-            none = DepthPlanes(np.zeros((added, 3)), np.zeros(added), np.zeros(added))
-            planes = self.planes.and_last(planes or none)
+            planes = self.planes.and_last(planes or DepthPlanes.unknown(len(x_in_world)))
         return Structure(np.concatenate([self.x_in_world, x_in_world]), both, self.noise, planes)
 
 

@@ -5,9 +5,7 @@ The paper's structure-only bundle adjustment: with fixed poses every point is it
     X_k = argmin sum_i rho(|| pi(P_i, X_k) - u_ki ||^2),     rho(s) = 2 c^2 (sqrt(1 + s / c^2) - 1)   (soft L1),
 
 so all points take Levenberg-Marquardt steps at once, each with its own damping. Residuals are divided by the standard
-deviation of their keypoint; in the paper's form this is one pixel for all.
-
-The equations are in `observations`.
+deviation of their keypoint; in the paper's form this is one pixel for all. The equations are in `observations`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,7 +37,7 @@ from .observations import (
 )
 
 ENTRY_BYTES = 2048
-"""Of a cached structure besides its arrays: objects, and the keys of ten references. Many have no points at all."""
+"""Memory of a cached structure besides its arrays: objects, and the keys of ten references."""
 
 
 @dataclass(frozen=True)
@@ -256,8 +254,7 @@ def query_tracks(
     by_first = np.argsort(offsets[view[first]] + theirs[first])  # the order of `build_tracks`
     points = np.concatenate([np.argsort(by_first)[point], np.arange(len(seen))])
     views = np.concatenate([view, np.full(len(seen), len(references))])
-    order = np.lexsort((views, points))
-    return Tracks(points[order], views[order], np.concatenate([theirs, seen[by_first]])[order])
+    return Tracks.in_order(points, views, np.concatenate([theirs, seen[by_first]]))
 
 
 def with_query_points(
@@ -298,6 +295,4 @@ def tracks_with_query(
     seen = structure.tracks.select(chosen)
     points = np.concatenate([seen.point, np.cumsum(chosen)[point] - 1])
     views = np.concatenate([seen.view, np.full(len(point), view)])
-    keypoints = np.concatenate([seen.keypoint, keypoint])
-    order = np.lexsort((views, points))
-    return Tracks(points[order], views[order], keypoints[order]), chosen
+    return Tracks.in_order(points, views, np.concatenate([seen.keypoint, keypoint])), chosen
