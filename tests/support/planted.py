@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.bundle.estimate import PoseEstimate
+from mapless_server.method.bundle.intrinsics import IntrinsicsEquations
 from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import Matches, PosedView, View
@@ -24,6 +25,9 @@ from mapless_server.method.structure.observations import (
 )
 from mapless_server.method.structure.structure import observe
 from support.scenes import SyntheticScene
+
+NO_INTRINSICS = IntrinsicsEquations(np.empty(0), np.empty(0), np.empty(0), np.empty(0), np.empty((6, 0)))
+"""The equations of a problem whose unknowns contain no errors of the intrinsics."""
 
 
 def true_correspondences(scene: SyntheticScene) -> Correspondences:

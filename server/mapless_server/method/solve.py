@@ -69,7 +69,7 @@ def _from_points(coarse: Coarse) -> Answer:
     if isinstance(estimate, Rejection):
         return coarse.answer(estimate, support)
     posed = support.posed(estimate)
-    agreement = priors.log10_chance(estimate.world_from_camera) if priors.has_directions else 0.0
+    agreement = priors.log10_chance(estimate.world_from_camera)
     failure, chance = _gated(posed, coarse, 0.0), 0.0
     if failure and agreement:
         failure, chance = _gated(posed, coarse, agreement), agreement
@@ -89,7 +89,7 @@ def _gated(support: PosedSupport, coarse: Coarse, log10_chance: float) -> str | 
     """Says why chance, or what is fixed to the camera, could give the pose; None if they could not."""
     pipeline, inlier_px = coarse.prepared.pipeline, coarse.prepared.pipeline.options.pnp.inlier_px
     failure = gate_failure(support.query.camera, support.matches, support.estimate.inliers, inlier_px, log10_chance)
-    return failure or unmoved_failure(support, inlier_px, pipeline.matcher.stationary, log10_chance)
+    return failure or unmoved_failure(support, inlier_px, pipeline.matcher.pairs.stationary, log10_chance)
 
 
 def _judged(support: PosedSupport, coarse: Coarse, chance: float, agreement: float) -> Answer:
@@ -113,7 +113,7 @@ def _from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
     prepared = coarse.prepared
     assert isinstance(coarse.reconstruction, Reconstruction)
     (reference,), (matches,) = prepared.references, prepared.correspondences.query_matches
-    (predicted,), fixed = coarse.reconstruction.references, prepared.pipeline.matcher.stationary
+    (predicted,), fixed = coarse.reconstruction.references, prepared.pipeline.matcher.pairs.stationary
     with prepared.context.stage("pnp"):
         found = solve_one_reference(prepared.query, reference, matches, predicted, scale, prepared.origin, fixed)
     if isinstance(found, Rejection):
@@ -139,7 +139,7 @@ def _from_lines(coarse: Coarse) -> Answer:
     if support is None:
         return coarse.answer(Rejection(RejectionReason.TOO_FEW_MATCHES, "no pose fits the epipolar lines of matches"))
     with prepared.context.stage("judge"):
-        evidence = two_view_evidence(without_unmoved(support, prepared.pipeline.matcher.stationary))
+        evidence = two_view_evidence(without_unmoved(support, prepared.pipeline.matcher.pairs.stationary))
         doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
         rejection = None if doubt else contradiction(support, votes_of(support), options.judge, unit=prepared.unit)
     if rejection:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.linalg
-from support.planted import NOISE, true_structure
+from support.planted import NO_INTRINSICS, NOISE, true_structure
 from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
@@ -95,7 +95,7 @@ def test_covariance_of_three_poses_equals_the_jackknife() -> None:
     references, regions = np.zeros((3, 6)), np.zeros((4, 6))
     references[:, 0], references[:, 4] = [1, 2, 6], [0, 3, 0]
     regions[:, 0] = [1, -1, 2, -2]
-    covariance = Dispersion(references, regions, np.zeros(6), 0.1).covariance(3.0)
+    covariance = Dispersion(references, regions, np.zeros(6), 0.1, NO_INTRINSICS).covariance(3.0)
     assert covariance[0, 0] == pytest.approx(2 / 3 * (4 + 1 + 9) + 9 * 10)
     assert covariance[4, 4] == pytest.approx(2 / 3 * (1 + 4 + 1))
     assert covariance[0, 4] == pytest.approx(2 / 3 * (2 - 2 - 3))

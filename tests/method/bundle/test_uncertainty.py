@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.compare import assert_jacobian, finite_differences
 from support.planted import (
+    NO_INTRINSICS,
     NOISE,
     disturbed,
     drift_field,
@@ -174,7 +175,7 @@ def test_covariance_grows_with_the_gap() -> None:
     options = replace(PLAIN, gap_growth=0.1)
 
     def trace(gap: float) -> float:
-        found = Dispersion(one, np.zeros((9, 6)), np.zeros(6), gap)
+        found = Dispersion(one, np.zeros((9, 6)), np.zeros(6), gap, NO_INTRINSICS)
         return float(np.trace(dispersed_covariance(found, RigidTransform(np.eye(3), np.zeros(3)), options)))
 
     assert trace(0.2) / trace(0.1) == pytest.approx(2**0.2)

@@ -151,7 +151,7 @@ def test_a_pair_is_separated_as_it_was_made() -> None:
     first, second = (replace(it, view=with_badge(it.view, random)) for it in (scene.references[0], scene.references[5]))
     matcher = Matcher()
     stored = matcher.pairs.make(first, second)
-    parts = PairMatches.of(first, second, stored, matcher.stationary)
+    parts = PairMatches.of(first, second, stored, matcher.pairs.stationary)
     np.testing.assert_array_equal(parts.all, stored)
     np.testing.assert_array_equal(parts.agreeing, matcher.pairs.match(first, second))
     every = mutual_matches(first.view.features, second.view.features, matcher.options.reference_ratio, True)

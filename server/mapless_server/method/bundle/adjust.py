@@ -1,23 +1,19 @@
-"""Adjustment: a last refinement, not in the paper: bundle adjustment of the query, its points and the references.
+"""Adjustment, the last refinement, not in the paper: the query, its points and the references together.
 
 The paper fixes the points before it solves for the query, and never moves the references. But the query observes the
-points too, and reference poses are never exact: they have noise, and errors of the lens model add to it. So here all
-are adjusted together (see `pose_problem`).
+points too, and reference poses have noise, and errors of the lens model. So all are adjusted (see `pose_problem`).
 
 Where references are few and far apart, most keypoints that the query shares with one of them are in no other: no point
 can be triangulated without the query. With the query's pose one can, and after its elimination it is an equation of
 the pose, the epipolar one of both keypoints (see `two_view`). Where these are many they are adjusted with the others.
 They are no inliers: whether the pose is accepted depends on them only by its radius, which they make smaller.
 
-The query's intrinsics stay as given: where they are right, poses are twice as accurate without these four unknowns.
-What the photograph says of their errors follows from the same normal equations, and the pose's covariance contains them
-(see `intrinsics`). A parameter that the photograph contradicts is estimated with the pose (see `recalibrate`).
+The query's intrinsics stay as given: where they are right, poses are more accurate without these four unknowns. What
+the photograph says of their errors follows from the same normal equations, and the pose's covariance contains them (see
+`intrinsics`). Parameters that the photograph contradicts are estimated with the pose: first all together, which shows
+the wrong ones; then these alone, the most significant one first. The photograph is read again with each value.
+
 Priors on the query's pose add their terms, unless the photograph alone contradicts them.
-
-Intrinsics that the photograph contradicts are estimated together with the pose.
-
-First all together, which shows the wrong ones; then these alone, the most significant one first. The photograph is read
-again with each value.
 """
 
 from dataclasses import replace
@@ -162,22 +158,15 @@ def _with_errors(
 
 
 SHARED_CAMERA = 0.03
-"""Share of the intrinsics' usual errors that differ between photographs of one camera. What they share is in the
-references' points too, and moves the pose but little: focus and stabilization remain. With 0.1 the covariance of these
-errors exceeds all others in scenes of one camera, where radii hold too often."""
+"""Share of the intrinsics' usual errors that differ between photographs of one camera, by focus and stabilization. What
+they share is in the references' points too, and moves the pose but little."""
 
 
 def adjust_pose(given: AdjustInput, estimate: PoseEstimate, priors: Priors = NO_PRIORS) -> PoseEstimate:
-    """Refines an estimate together with its points and, within their noise, the references.
+    """Refines an estimate, whose errors select the matches, together with its points and the references.
 
-    Args:
-        given: what the pose is adjusted to.
-        estimate: the initial pose; its errors select the matches.
-        priors: on the query's pose. Each is checked against the pose from the photograph alone; only consistent ones
-            are used.
-
-    Returns:
-        The estimate with a refined pose and its covariance; unchanged if the adjustment fails.
+    Each prior on the query's pose is checked against the pose from the photograph alone; only consistent ones are used.
+    Returns the estimate with a refined pose and its covariance; unchanged if the adjustment fails.
     """
     # If no prior is used, the answer is bit-identical to the one without priors.
     without_priors = estimate.without_priors or estimate
@@ -288,15 +277,10 @@ def with_covariance(
     priors: Priors = NO_PRIORS,
     points_are_predicted: bool = False,
 ) -> PoseEstimate:
-    """The estimate with the covariance of its pose, and the evidence of errors of its intrinsics.
+    """The estimate of a support, of any stage, with its pose's covariance and the evidence of errors of its intrinsics.
 
-    Args:
-        support: the pose's support, with an estimate of any stage.
-        scale: its metric scale, whose deviation is used as its relative standard deviation.
-        options: of the adjustment.
-        priors: on the pose; those that were used reduce the covariance.
-        points_are_predicted: whether the structure's points are predicted by the reconstruction, rather than
-            triangulated from the references' poses.
+    The deviation of the metric scale is its relative standard deviation; it counts for initial poses, and where points
+    are predicted by the reconstruction rather than triangulated. Priors that were used reduce the covariance.
     """
     estimate, references = support.estimate, support.references
     if estimate.is_adjusted:

@@ -12,31 +12,10 @@ The answer's covariance is that of world_from_camera in ROS's order (see `optimi
     offset       o o^T, o the Gauss-Newton step from the pose to its optimum, for an initial pose that is answered as it
                  is.
 
-The first two measure the errors of this very photograph, so they hold in scenes that nobody
-tuned: over twelve scenes and two kinds of features, the factor between radii and errors varies by a fifth (standard
-deviation of its logarithm 0.21 for positions, 0.20 for angles), by as much as chance makes it from fifty answers. The
-inverse of the normal equations, which contains the modelled errors of reference poses, varies by 0.77 and 0.62: where
-references disagree because points move with the viewpoint, it takes this for errors of their poses.
-
-What all matches share (one lens model, one survey) shows in neither, and what neighbouring references share in part.
-With simulated noise of pixels and of reference poses, each its own, standard deviations are right within a third; where
-the references' errors drift by twice the pixels' noise, errors are up to 1.8 times as large as stated (the tests).
-
-What the references cannot say of themselves enlarges both: keypoints move with the viewpoint, for all references to the
-same side. Within 11 of 12 scenes errors grow more than radii with the gap, the distance to the nearest reference by the
-depth. The radii of an answer contain, too, how far halves of its data disagree (`radii`).
-
-Three factors remain: on the standard deviations of positions and of angles, and on the radii of 95 %, because errors
-have heavier tails than the normal distribution. They were measured on scenes with known poses, each tested
-on a scene that it was not measured on.
-
-The dispersion is how an adjusted pose changes without parts of its data.
-
-A sum over residuals treats them as independent, as if a thousand matches were a thousand measurements. But errors are
-shared: by all points that a reference observes (its pose, its lens model, its shutter), and by neighbours in the
-photograph (lens model, shutter, surfaces, the way a keypoint moves with the viewpoint). The jackknife (Quenouille;
-Efron and Tibshirani 1993, chapter 11) finds what is shared within each part of the data by leaving it out. Two kinds of
-parts cross each other (Cameron, Gelbach and Miller, Robust inference with multiway clustering, 2011):
+The dispersion is how an adjusted pose changes without parts of its data: a sum over residuals would treat errors as
+independent that matches share. The jackknife (Quenouille; Efron and Tibshirani 1993, chapter 11) finds what is shared
+within each part of the data by leaving it out. Two kinds of parts cross each other (Cameron, Gelbach and Miller, Robust
+inference with multiway clustering, 2011):
 
     references    from the poses q_(i) without the observations of reference i, i = 1 ... K,
                   C_r = (K - 1) / K sum_i (q_(i) - mean) (q_(i) - mean)^T;
@@ -47,11 +26,15 @@ parts cross each other (Cameron, Gelbach and Miller, Robust inference with multi
 Both are of the pose as it is estimated: by the normal equations of the adjustment at its optimum (see `bundle`), where
 the references may move and far ones are held less, and of which each q_(i) is one Newton step.
 
+What all matches share (one lens model, one survey) shows in neither, and what neighbouring references share in part:
+where the references' errors drift, errors are larger than stated. Keypoints move with the viewpoint, for all references
+to the same side: errors grow more than radii with the gap (see `estimate`), by which both are enlarged. Factors on the
+standard deviations of positions and of angles remain; they are measured on scenes with known poses.
+
 The step needs the curvature of the loss, which is less than its weight w: without a part of the data, residuals of the
 others grow and lose weight, so the pose moves farther than with weights that stay. Cauchy's loss curves by w across a
 residual and by w (2 w - 1) along it (Triggs et al. 2000), on average over the directions by w^2. So the equations are
-those of weighted least squares with weights w^2 and residuals r / w, with the same gradient. With weights w radii were
-too small where residuals have heavy tails: errors by radii varied more, between scenes and within them.
+those of weighted least squares with weights w^2 and residuals r / w, with the same gradient.
 
 Let F F^T be what eliminating the points subtracts from the normal equations, F_p = E_p L_p^-T of point p, whose
 information is L_p L_p^T; and l_p = L_p^-1 h_p, of its gradient. An observation with residual r, weight w and derivative
@@ -67,7 +50,7 @@ they are; with the poses eliminated too, what is left says what the data and the
 `intrinsics`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,14 +73,12 @@ class UncertaintyOptions:
 
     Attributes:
         region_factor: factor on the standard deviations of the regions' part: the fit of the pose hides a part of the
-            errors that a region shares. With 1 instead of 1.5 errors by radii vary more, within scenes and between.
+            errors that a region shares.
         position_factor, rotation_factor: factors on standard deviations. Below 1, because noise of a single keypoint
-            is both in the references' part and in that of the regions. Photographs of twelve places say 0.72 for
-            positions; planted noise with correlated errors of references requires 0.76.
-        gap_growth: exponent of the gap in the factor on standard deviations. Larger ones fit a scene's few references
-            better, but make radii of the closest too small.
-        max_matches: largest number of the photograph's matches, evenly thinned; the time is linear in it. Using all
-            matches gives no better radii.
+            is both in the references' part and in that of the regions.
+        gap_growth: exponent of the gap in the factor on standard deviations. Larger ones make radii of the closest
+            references too small.
+        max_matches: largest number of the photograph's matches, evenly thinned; the time is linear in it.
     """
 
     region_factor: float = 1.5
@@ -115,19 +96,16 @@ DAMPING = 1e-9
 """Relative, of the points: one without enough observations is determined, and has no information to speak of."""
 
 LEAST_EIGENVALUE = 1e-7
-"""Least eigenvalue of the pose's information with unit diagonal: below, the pose is not determined. Above 1e-5 in
-photographs."""
+"""Least eigenvalue of the pose's information with unit diagonal: below, the pose is not determined."""
 
 LEAST_VARIANCE = 1e-12
 """Of S, as a share of I / w, where its point has no other observation but rounding."""
 
 LEAST_LEFT = 0.01
-"""Share of the pose's information added to what is left without a reference, which may not determine a pose. Against
-planted noise, where each of two references is needed, errors are 0.65 to 0.96 of what is stated; with 0.03 they are
-0.89 to 1.07 of it, but photographs with three to five references need more."""
+"""Share of the pose's information added to what is left without a reference, which may not determine a pose."""
 
 REGIONS = 3
-"""Columns of the photograph, and regions in each. With 2 or 4 radii hold about as well."""
+"""Columns of the photograph, and regions in each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,14 +117,14 @@ class Dispersion:
         regions: (G, 6) influence of the matches in each region of the photograph.
         offset: (6,) the Gauss-Newton step from the pose to the optimum.
         gap: distance to the nearest reference that holds the pose, over the median depth of the points.
-        intrinsics: what the data say of errors of the intrinsics; None if the problem has not these unknowns.
+        intrinsics: what the data say of errors of the intrinsics; empty if the problem has not these unknowns.
     """
 
     references: Array
     regions: Array
     offset: Array
     gap: float
-    intrinsics: IntrinsicsEquations | None = None
+    intrinsics: IntrinsicsEquations
 
     def covariance(self, region_factor: float) -> Array:
         """Covariance C_r + f^2 C_p (6, 6)."""
@@ -159,11 +137,8 @@ class Dispersion:
 def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Dispersion | None:
     """Computes how the query's pose changes without parts of the data; None if all data do not determine it.
 
-    Args:
-        problem: problem of the adjustment; its priors on the query's pose are not used.
-        bundle: its optimum, or values near it.
-        max_matches: largest number of the query's matches, evenly thinned; the shared errors are the same in all of
-            them.
+    The bundle is the optimum of the adjustment's problem, or near it; the problem's priors on the pose are not used. At
+    most `max_matches` of the query's matches are, evenly thinned: shared errors are the same in all of them.
     """
     seen, bundle, thinning = _thinned(problem.by_view, bundle, max_matches)
     there = seen.at(bundle)
@@ -195,18 +170,15 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     influences, known = _by_region(seen, regions, to_both, residual, there.by_pose, weight, points)
     if not (np.isfinite(poses).all() and np.isfinite(influences).all()):
         return None
-    found = Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0], _gap(seen, bundle))
-    if not len(to_rest):
-        return found
     observing = [0, *(i + 1 for i, part in enumerate(seen.parts[:-1]) if part.start < part.stop)]
     intrinsics = IntrinsicsEquations(
         thinning * rest[observing, :, :-1],
         thinning * rest[observing, :, -1],
         thinning * known,
         thinning * influences[:, 6:],
-        -solved[0, query, :-1],
+        world_jacobian(bundle.world_from_query) @ -solved[0, query, :-1],
     )
-    return replace(found, intrinsics=intrinsics)
+    return Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0], _gap(seen, bundle), intrinsics)
 
 
 def dispersed_covariance(
@@ -214,11 +186,7 @@ def dispersed_covariance(
 ) -> Array:
     """Covariance (6, 6) of a pose without the parts of scale and intrinsics, with the factors.
 
-    Args:
-        dispersion: dispersion of the pose.
-        world_from_camera: the pose.
-        options: options of the covariance.
-        is_offset: whether the pose is known not to be at the optimum.
+    `is_offset` is whether the pose is known not to be at the optimum.
     """
     grown = gap_ratio(dispersion.gap) ** (2 * options.gap_growth)
     covariance = grown * dispersion.covariance(options.region_factor)
@@ -284,16 +252,12 @@ def _rows_of_pose(matrix: Array) -> Array | None:
         rows = np.asarray(np.linalg.solve(matrix, np.eye(len(matrix))[:, -6:]).T)
     except np.linalg.LinAlgError:
         return None
-    return rows if _is_definite(rows[:, -6:]) else None
-
-
-def _is_definite(covariance: Array) -> bool:
-    """Whether a symmetric matrix (6, 6) is well-conditioned and positive definite, whatever its units."""
-    if not np.isfinite(covariance).all():
-        return False
-    information = np.linalg.pinv(covariance, hermitian=True)
-    unit = np.sqrt(np.diag(information).clip(min=0))
-    return bool(unit.min() > 0 and np.linalg.eigvalsh(information / np.outer(unit, unit))[0] > LEAST_EIGENVALUE)
+    if not np.isfinite(rows[:, -6:]).all():
+        return None
+    information = np.linalg.pinv(rows[:, -6:], hermitian=True)
+    unit = np.sqrt(np.diag(information).clip(min=0))  # whatever the units of the pose
+    is_definite = unit.min() > 0 and np.linalg.eigvalsh(information / np.outer(unit, unit))[0] > LEAST_EIGENVALUE
+    return rows if is_definite else None
 
 
 def _regions(seen: ViewColumns) -> list[NDArray[np.intp]]:
@@ -305,17 +269,6 @@ def _regions(seen: ViewColumns) -> list[NDArray[np.intp]]:
         for rows in np.array_split(np.argsort(ideal[0], kind="stable"), REGIONS)
     )
     return [it for column in columns for it in np.array_split(column, REGIONS)]
-
-
-def _by_camera(seen: ViewColumns, by_pose: Array) -> Iterator[tuple[slice, slice, Array]]:
-    """Of each view: its observations (O,), its unknowns, and the derivatives of the residuals by them, (2, U, O)."""
-    *references, query = seen.parts
-    for i, part in enumerate(references):
-        yield part, slice(6 * i, 6 * i + 6), by_pose[:, :, part]
-    slopes = by_pose[:, :, query]
-    if seen.by_intrinsics.size:
-        slopes = np.concatenate([slopes, seen.by_intrinsics], axis=1)
-    yield query, slice(6 * len(references), None), slopes
 
 
 def _by_region(
@@ -331,7 +284,12 @@ def _by_region(
 
     The points are eliminated; the matrix is in the last I combinations, of the intrinsics.
     """
-    slopes = [rows[:, unknowns] @ by_camera for _, unknowns, by_camera in _by_camera(seen, by_pose)]
+    *references, query = seen.parts
+    slopes = [rows[:, 6 * i : 6 * i + 6] @ by_pose[:, :, part] for i, part in enumerate(references)]
+    by_query = by_pose[:, :, query]
+    if seen.by_intrinsics.size:
+        by_query = np.concatenate([by_query, seen.by_intrinsics], axis=1)
+    slopes.append(rows[:, 6 * len(references) :] @ by_query)
     of_observation = np.concatenate(slopes, axis=2)  # (2, R, O)
     lost = (rows @ points.cross).reshape(len(rows), *points.gradient.shape)
     of_match = summed(seen.sums, (of_observation * (weight * residual)[:, None]).sum(axis=0))

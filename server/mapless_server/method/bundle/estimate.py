@@ -1,16 +1,19 @@
-"""A pose, its support and its radii: data between the estimators and the judge.
+"""A pose, its support and its radii, which errors do not exceed with a given probability.
 
-Errors do not exceed the radii with a given probability; they grow with the distance.
+These are the data between the estimators and the judge. Errors grow with the gap: the distance to the nearest reference
+that holds the pose, as a share of the depth.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import gammaincinv
 
 from mapless.geometry import Array, RigidTransform
 
@@ -20,13 +23,6 @@ from .priors import IntrinsicsSigma, PriorCheck
 
 if TYPE_CHECKING:  # services do not load what computes
     from .intrinsics import IntrinsicsEvidence
-
-
-import math
-from dataclasses import replace
-
-from numpy.typing import ArrayLike
-from scipy.special import gammaincinv
 
 
 class PoseStage(str, Enum):
@@ -144,12 +140,12 @@ class PosedSupport(Support):
         return int(self.estimate.inliers.sum()) + of_two_views
 
     def distance_m(self) -> float:
-        """Median depth of the inliers' points at the estimate; always positive."""
+        """Median depth of the inliers' points at the estimate; always positive, and next to 0 without points."""
         x_in_world = self.structure.x_in_world[self.matches.point[self.estimate.inliers]]
         if self.two_view is not None:
             x_in_world = np.concatenate([x_in_world, self.two_view.x_in_world[self.two_view.inliers]])
         depth_m = self.estimate.world_from_camera.inverse().apply(x_in_world)[:, 2]
-        return max(float(np.median(depth_m)), float(np.finfo(float).tiny))
+        return max(float(np.nanmedian(depth_m)) if len(depth_m) else 0.0, float(np.finfo(float).tiny))
 
     def inliers_by_reference(self) -> tuple[int, ...]:
         """Number of inliers on points that each reference observes, and of two-view inliers with it."""
@@ -168,7 +164,6 @@ def observers(structure: Structure, points: NDArray[np.intp]) -> NDArray[np.intp
 
 TAIL_95 = 1.47
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Measured once (server/research)."""
-
 
 SELF_TAIL_95 = 1.3
 """The same for answers of a scene that is calibrated: the other one has to cover that scenes differ."""
@@ -206,24 +201,22 @@ def self_tail(count: int) -> float:
 
 
 JACKKNIFE_SHARE = 0.6
-"""Of the jackknife's variance where halves count, too; alone it has to contain all of the errors. Of 32
-places, each left out, the others choose 0.5 or 0.6 (20 and 12); planted noise of reference poses requires 0.56."""
+"""Share of the jackknife's variance where halves count, too; alone it has to contain all of the errors."""
 
 MOST_DISAGREEMENT = 3.0
-"""Of half of the distance between halves, in 68 % radii by the jackknife, so that these grow at most 3.2-fold. Halves
-further apart have failed, one of them at least, and how far says nothing any more."""
+"""Largest half of the distance between halves that counts, in 68 % radii by the jackknife. Halves further apart have
+failed, one of them at least."""
 
 
 def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
     """An estimate whose radii contain, too, that the cameras by halves of its data are `apart_m` from each other.
 
     Two independent halves have twice the variance of both together each, so their cameras are two standard deviations
-    apart, and the square of half of the distance estimates the variance. The jackknife is linear at the pose, and does
-    not see how far halves move that fit as well elsewhere, as with a narrow view of something far, where turning and
-    stepping aside look alike. The distance of a few splits varies, and shows no errors of reference poses that all
-    references share, so a share of the jackknife's variance is added. Turning belongs to stepping aside, so the whole
-    covariance is multiplied. Errors of the intrinsics are the same in both halves, so they count in full. Halves know
-    nothing of priors: an estimate with these stays as it is.
+    apart, and the square of half of the distance estimates the variance. The jackknife, which is linear at the pose,
+    does not see how far halves move that fit as well elsewhere. The distance of a few splits varies, and shows no
+    errors of reference poses that all references share, so a share of the jackknife's variance is added. Turning and
+    stepping aside look alike, so the whole covariance is multiplied. Errors of the intrinsics are the same in both
+    halves, so they count in full. Halves know nothing of priors: an estimate with these stays as it is.
     """
     radius_m = accuracy_from_covariance(estimate.covariance).position_68_m
     if estimate.without_priors is not None or not radius_m > 0:
@@ -273,25 +266,16 @@ LEAST_GAP, LARGEST_GAP = 0.03, 0.5
 """Beyond these, radii do not change with the gap."""
 
 SMALLEST_GAP = 0.01
-"""Below, the ratio of errors to radii does not change either: references that are left out of a film of a hall are at
-0.05, its photographs at 0.01 of what they see, and their ratios differ by 1.6."""
+"""Below, the ratio of errors to radii does not change either."""
 
 SUPPORTING_SHARE = 0.1
 """References with fewer inliers, by those of the one with the most, do not hold the pose."""
 
 
 def viewpoint_gap(support: PosedSupport) -> tuple[float, float]:
-    """Distance to the nearest reference that holds the pose, over the median depth of the inliers; and that depth.
-
-    ValueError if there is no estimate.
-    """
-    pose, counts = support.estimate.world_from_camera, np.array(support.inliers_by_reference())
-    points = [support.structure.x_in_world[support.matches.point[support.estimate.inliers]]]
-    if support.two_view is not None:
-        points.append(support.two_view.x_in_world[support.two_view.inliers])
-    depth = pose.inverse().apply(np.concatenate(points))[:, 2]
-    depth_m = max(float(np.nanmedian(depth)) if len(depth) else 0.0, np.finfo(float).tiny)
-    holding = np.flatnonzero(counts >= SUPPORTING_SHARE * counts.max())
+    """Distance to the nearest reference that holds the pose, over the median depth of the inliers; and that depth."""
+    pose, counts, depth_m = support.estimate.world_from_camera, support.inliers_by_reference(), support.distance_m()
+    holding = np.flatnonzero(np.array(counts) >= SUPPORTING_SHARE * max(counts))
     centres = np.array([support.references[i].world_from_camera.translation for i in holding])
     return float(np.linalg.norm(centres - pose.translation, axis=1).min()) / depth_m, depth_m
 

@@ -11,9 +11,8 @@ where D is the given lens model: dD/dk1 = y |y|^2 for radial-tangential distorti
 theta^3 y / |y| for a fisheye.
 
 With all other unknowns eliminated from the normal equations of an adjustment, what is left is the information that the
-photograph's matches have of these errors. Of a flat wall that is next to none: the standard deviations say so. They
-contain what matches share, errors of the references and whatever a region of the photograph has in common, because they
-measure how the estimate changes without each of these parts.
+photograph's matches have of these errors; of a flat wall that is next to none. The standard deviations contain what
+matches share, because they measure how the estimate changes without each reference and each region (see `dispersion`).
 """
 
 from collections.abc import Sequence
@@ -34,7 +33,7 @@ PRINCIPAL = (1, 2)
 
 OTHER_CAMERA_SIGMAS = 3.0
 """A photograph whose focal length or principal point is off by more, of standard deviations of an error that it alone
-has, does not share the references' camera. Six of 337 right answers exceed it, in three places of several cameras."""
+has, does not share the references' camera."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,10 @@ class ContradictionOptions:
     """Options that define when a photograph contradicts a parameter of its intrinsics.
 
     Attributes:
-        sigmas: it is off by more standard deviations of the given and the estimated value together. With the default
-            under 1 % of right photographs are contradicted in each of eleven scenes; with 4.75 in ten of these. In the
-            other each photograph's given intrinsics were estimated from it alone.
+        sigmas: it is off by more standard deviations of the given and the estimated value together.
         focal_share, principal_share, k1: standard deviations (of the focal length and the width, as shares) above
-            which a photograph does not determine a parameter. Noise in the depth of a flat wall's points looks like
-            relief of the wall: its focal length was off by 72 % with a standard deviation of 8.5 %.
+            which a photograph does not determine a parameter: noise in the depth of a flat wall's points looks like
+            relief of the wall.
     """
 
     sigmas: float = 6.75
@@ -72,7 +69,7 @@ class IntrinsicsEquations:
     Attributes:
         matrices, gradients: (1 + K, I, I) and (1 + K, I): of all data, and without each of K references.
         region_matrices, region_gradients: (G, I, I) and (G, I): the parts of G regions of the photograph.
-        motion: (6, I) how the pose moves with each error, as a left perturbation of camera_from_world.
+        motion: (6, I) how the pose moves with each error: x y z rx ry rz, fixed world axes.
     """
 
     matrices: Array
@@ -176,25 +173,18 @@ class IntrinsicsTerms:
 def intrinsics_evidence(
     equations: IntrinsicsEquations,
     terms: IntrinsicsTerms,
-    to_world: Array,
     suspicion: ContradictionOptions,
     inflation: float,
     region_factor: float,
 ) -> IntrinsicsEvidence | None:
     """Computes the evidence from normal equations of the errors of the intrinsics; None if they are singular.
 
-    Args:
-        equations: the normal equations of these errors.
-        terms: the photograph, and its intrinsics without the matches.
-        to_world: (6, 6) derivative of the world error by the pose's unknowns.
-        suspicion: an error that exceeds this counts in full in the pose's covariance: given intrinsics are right or far
-            off, and the latter more often than a normal distribution says.
-        inflation: see `IntrinsicsEquations.estimate`.
-        region_factor: see `UncertaintyOptions`.
+    An error that exceeds `suspicion` counts in full in the pose's covariance: given intrinsics are right or far off,
+    the latter more often than a normal distribution says. The factors are those of `IntrinsicsEquations.estimate`.
     """
     given, removed, prior_sigma, held_sigma = terms.given, terms.removed, terms.prior_sigma, terms.held_sigma
     try:
-        # Of an error that moves no keypoint, k1 of a lens model without such a coefficient, only the prior is known.
+        # Only the prior is known of an error that moves no keypoint: k1 of a lens model without such a coefficient.
         is_seen = np.diag(np.diag(equations.matrices[0]) > 0)
         others = np.where(is_seen, 0.0, prior_sigma**-2.0)
         found, covariance = equations.estimate(removed, others, inflation, region_factor)
@@ -203,9 +193,7 @@ def intrinsics_evidence(
         is_other = np.abs(value) > OTHER_CAMERA_SIGMAS * np.hypot(held_sigma, sigma)
         held_sigma = np.maximum(held_sigma, prior_sigma) if is_other[:3].any() else held_sigma
         doubtful = suspicion.contradicted(value, sigma, prior_sigma, given.camera.width_px)
-        doubtful &= (held_sigma >= prior_sigma) | np.array(
-            [False, False, False, True]
-        )  # K of a shared camera errs alike
+        doubtful[:3] &= held_sigma[:3] >= prior_sigma[:3]  # K of a shared camera errs alike
         held = np.where(doubtful, np.maximum(held_sigma, np.abs(value)), held_sigma)
         found, covariance = equations.estimate(removed, held**-2.0, inflation, region_factor)
     except np.linalg.LinAlgError:
@@ -213,8 +201,8 @@ def intrinsics_evidence(
     left = found - removed
     camera = replace(given.camera, distortion=given.distortion)
     sent = given.photograph.camera if given.photograph else camera
-    total, motion = covariance + np.outer(left, left), to_world @ equations.motion
-    evidence = IntrinsicsEvidence(camera, sent, value, sigma, prior_sigma, total, motion, removed)
+    total = covariance + np.outer(left, left)
+    evidence = IntrinsicsEvidence(camera, sent, value, sigma, prior_sigma, total, equations.motion, removed)
     return evidence if np.isfinite(evidence.pose_covariance).all() and np.isfinite(sigma).all() else None
 
 

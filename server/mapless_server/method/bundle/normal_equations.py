@@ -18,7 +18,15 @@ from scipy.sparse import csc_array
 from mapless.geometry import Array, RigidTransform
 
 from ..features.tracks import summed
-from ..optim.optimize import apply_columns, cauchy_weight, columns, pose_columns, symmetric_products, take
+from ..optim.optimize import (
+    apply_columns,
+    cauchy_weight,
+    columns,
+    cross_matrices,
+    pose_columns,
+    symmetric_products,
+    take,
+)
 from ..structure.model import DepthPlanes
 from ..structure.observations import Observations
 
@@ -91,8 +99,7 @@ def _rotations(vectors: Array) -> Array:
     small = [angle < 1e-8 for angle in angles]
     first = np.array([1.0 if s else math.sin(a) / a for s, a in zip(small, angles, strict=True)])
     second = np.array([0.5 if s else (1 - math.cos(a)) / a**2 for s, a in zip(small, angles, strict=True)])
-    cross = np.zeros((len(vectors), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = vectors, -vectors
+    cross = cross_matrices(vectors)
     return np.asarray(np.eye(3) + first[:, None, None] * cross + second[:, None, None] * cross @ cross)
 
 
@@ -172,9 +179,7 @@ class ViewColumns:
     def equations(
         self, there: Linearized, loss_scale_sigma: float, least_curvature: float = 1.0, weight: Array | None = None
     ) -> NormalEquations:
-        """The normal equations of the observations alone, for a Cauchy loss of this scale.
-
-        `weight` (O,) replaces the loss's.
+        """The normal equations of the observations alone, for a Cauchy loss of this scale or for weights (O,).
 
         With `least_curvature` below 1 derivatives J become (I - (1 - c) r r^T / |r|^2) J and residuals r become r / c,
         which leaves the gradient as it is. For a weight w the loss curves by w (2 w - 1) along r. But c^2 is least at

@@ -7,10 +7,9 @@ covariance C, by which neighbours move together and far references are held less
 references' observations (below). The points are eliminated (see `bundle`).
 
 A given pose has an error of its own (a marker, a surveyor's reading) and one that it shares with its neighbours and
-that drifts with the distance (odometry, the lens model, the scale of a reconstruction). A query's pose is known
-relative to the references around it, so what counts are the references' errors relative to the place of the query, x_q.
-The drift is modelled as a random walk over space, whose variance grows in proportion to the distance; then errors i and
-j have the covariance
+that drifts with the distance (odometry, the lens model, the scale of a reconstruction). What counts are these errors
+relative to the place of the query, x_q. The drift is a random walk over space, whose variance grows in proportion to
+the distance (the linear variogram: Matheron, Principles of geostatistics, 1963). Errors i and j have the covariance
 
     C_ij = a^2 delta_ij + b^2 (|x_i - x_q| + |x_j - x_q| - |x_i - x_j|) / 2 d,
 
@@ -21,8 +20,6 @@ hold it, far ones hold little, and several far ones that are neighbours no more 
 The sizes a and b are the most probable ones under the observations of the references. At the given poses, with points
 and query eliminated from the normal equations of the adjustment, the gradient g of the references' motions has the
 covariance S + S C S, where S is the matrix. Where references share little, the prior of a and b decides.
-
-The random walk is the linear variogram of geostatistics (Matheron, Principles of geostatistics, 1963).
 """
 
 import math
@@ -37,7 +34,7 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 
 from ..features.views import Matches, PosedView, View
-from ..optim.optimize import MinimizeOptions, minimize, world_jacobian
+from ..optim.optimize import MinimizeOptions, minimize
 from ..structure.model import PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, bundle_of
@@ -62,17 +59,15 @@ LEAST_SPACING = 0.05
 """Smallest d, as a share of the depth of the points: references at one place have no distance to measure drift by."""
 
 OWN = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
-"""Values of a that are tried, in units of the structure's noise. The smallest is that of a reconstruction from these
-very photographs."""
 DRIFT = (0.1, 0.2, 0.4, 1.0, 2.0, 4.0)
-"""Values of b that are tried."""
+"""Values of a and b that are tried, in units of the structure's noise; the smallest a is that of a reconstruction from
+these very photographs."""
 USUAL_OWN, USUAL_DRIFT, PRIOR_LOG = 0.1, 0.4, 1.5
 """Medians of the priors of a and b, log-normal and wide, and the standard deviation of their logarithms: ten references
 determine both, three do not. Reconstructions are smooth, so without evidence the poses drift."""
 OWN_INFLATION, DRIFT_INFLATION = 1.5, 2.0
 """Factors on the a and b that are found from residuals. Keypoints move with the viewpoint, by the same for far
-references, so the drift is larger than residuals say. With 1 the median is 0.167 instead of 0.150 cm in a kitchen, 0.55
-instead of 0.53 on a drive. Where the errors are all the poses' own, more of the drift makes the answer worse."""
+references, so the drift is larger than residuals say."""
 
 
 @dataclass(frozen=True)
@@ -89,19 +84,16 @@ class AdjustOptions:
         iterations: largest number of Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
         min_motion_sigma: stop when a step moves the pose by less, in standard deviations by the residuals; errors are
-            several of these. In a kitchen three steps are made, and poses differ from those of forty by 0.07 standard
-            deviations.
-        least_curvature: see `BundleProblem`. With 1 it takes one or two steps more; less than 0.5 saves none.
+            several of these.
+        least_curvature: see `BundleProblem`.
         suspicion: when an error of the intrinsics counts in full in the covariance.
         trial: when it is tried to estimate the intrinsics with the pose. A large error makes residuals large, where the
             loss hardly curves: with the intrinsics as given it seems undetermined, and is not where it is estimated.
-        agreeing_share: or when fewer of the matches are inliers. In a kitchen with five references, where k1 was off by
-            0.3, one pose of six aroused suspicion; of the others this finds four.
+        agreeing_share: or when a smaller share of the matches are inliers.
         contradiction: when this estimate is used.
         rounds: how often, at most, the query's keypoints are corrected by an estimated parameter.
         min_added_share: keypoints that the query shares with references, and no point has, are adjusted too where there
-            are so many for each inlier. Errors of 613 photographs of ten places are 0.86 times as large with them;
-            where there were fewer, those of 152 are 1.06 times as large.
+            are so many for each inlier.
         query_points: options of triangulating these.
         uncertainty: options of the answer's covariance.
     """
@@ -277,10 +269,9 @@ def errors_of_pose(
     dispersion = disperse(wider, bundle, options.uncertainty.max_matches)
     if dispersion is None:
         return None
-    assert dispersion.intrinsics is not None
     covariance = dispersed_covariance(dispersion, pose, options.uncertainty, is_offset)
-    to_world, factors = world_jacobian(pose), (options.error_inflation, options.uncertainty.region_factor)
-    evidence = intrinsics_evidence(dispersion.intrinsics, intrinsics, to_world, options.suspicion, *factors)
+    factors = options.error_inflation, options.uncertainty.region_factor
+    evidence = intrinsics_evidence(dispersion.intrinsics, intrinsics, options.suspicion, *factors)
     return (covariance if evidence is None else covariance + evidence.pose_covariance), evidence
 
 

@@ -35,7 +35,7 @@ LIKELY_PROBABILITY = 0.01
 
 MIN_RELATIVE_INFORMATION = 0.1
 """A prior with a smaller share of the photograph's information is not used: it could lower no standard deviation by
-more than 5 %, and its error may exceed its own standard deviation."""
+more than 5 %."""
 
 UNIT_TOLERANCE = 1e-6
 """Largest deviation of the length of a direction from one."""
@@ -81,7 +81,7 @@ class Term:
     Attributes:
         residual: r, (n,).
         jacobian: J, (n, 6): the derivative of r by an error of the pose.
-        covariance: C, (n, n), of r if the pose were the true one.
+        covariance: C, (n, n), of r at the true pose.
     """
 
     residual: Array
@@ -287,11 +287,6 @@ class Priors:
     def __bool__(self) -> bool:
         return any(True for _ in self)
 
-    @property
-    def has_directions(self) -> bool:
-        """Whether `log10_chance` can differ from 0."""
-        return self.gravity is not None or self.heading is not None
-
     def shifted(self, offset: Array) -> Priors:
         """Returns the priors in a world in which everything lies `offset` (3,) further."""
         return Priors(**{prior.kind.value: prior.shifted(offset) for prior in self})  # type: ignore[arg-type]
@@ -346,7 +341,7 @@ class Priors:
 
         A random direction is within an angle a of the right one with probability (1 - cos a) / 2. Both priors may come
         from one sensor, so only the more accurate one counts. Position and pose priors do not count: they select the
-        references and the search area in which wrong matches are found.
+        references and the area in which wrong matches are found.
         """
         directions = [prior for prior in (self.gravity, self.heading) if prior is not None]
         threshold = conflict_threshold(DirectionPrior.degrees_of_freedom)

@@ -1,4 +1,4 @@
-"""Checks of a group: whether its photographs contradict a rig's mounting or a session's unit. Also its hints.
+"""Checks of a group: whether its photographs contradict a rig's mounting or a session's unit; and its hints.
 
 A wrong mounting or unit still gives a pose with small radii, because the photographs that fit agree well. The evidence
 against it is the inliers that other photographs lose, and the length of the path.
@@ -154,24 +154,18 @@ def hinted_group(
     """
     if rejection.hint is not None:
         return rejection
-    matches, best = _best(images)
+    counted = [
+        (count, reference.name if count else None)
+        for answer, references in images
+        for count, reference in zip(answer.reference_match_counts, references, strict=False)
+    ]
+    matches, best = max(counted, key=lambda it: it[0], default=(0, None))
     alone = sum(isinstance(answer.outcome, Localization) for answer, _ in images)
     # Intrinsics and references are right where photographs are localized alone.
     if is_sequence and alone > 1 and rejection.reason in (RejectionReason.PNP_FAILED, RejectionReason.GATE):
         return replace(rejection, hint=replace(CHECK_TRACKING, best_reference=best))
     advice, message = _advice(rejection.reason, matches, len(images))
     return replace(rejection, hint=Hint(STAGE, advice, message, best))
-
-
-def _best(images: Sequence[tuple[Answer, Sequence[PosedView]]]) -> tuple[int, str | None]:
-    """Returns the most matches of a reference with any of the photographs, and its name; None if there are none."""
-    counted = [
-        (count, reference.name)
-        for answer, references in images
-        for count, reference in zip(answer.reference_match_counts, references, strict=False)
-    ]
-    count, name = max(counted, key=lambda it: it[0], default=(0, None))
-    return count, name if count else None
 
 
 def _advice(reason: RejectionReason, matches: int, image_count: int) -> tuple[Advice, str]:

@@ -1,11 +1,9 @@
 """Drift of a device's tracking: relative poses of consecutive frames, with their noise.
 
 The noise of a step between two frames grows with its length and angle, and has a floor. Steps have independent errors,
-so that they add up to drift. Some devices are worse than others, and tracking can also jump: each step has a switch
-(see `optimize`), so that one with an error far beyond its noise loses its weight; those at which the tracking jumps are
-cut (see `jumps`).
-
-If the unit of the session is unknown (monocular tracking), all steps share one more unknown, the scale.
+so that they add up to drift. Each step has a switch (see `optimize`), so that one with an error far beyond its noise
+loses its weight; those at which the tracking jumps are cut (see `jumps`). If the unit of the session is unknown
+(monocular tracking), all steps share one more unknown, the scale.
 """
 
 import itertools
@@ -22,17 +20,20 @@ from ..optim.optimize import perturbed, rotation_vector, switched_cost, switched
 _MEDIAN_SQUARE = 5.35
 """Median of a chi-square of six degrees of freedom."""
 
-
 SHARE, FLOOR_M = 0.012, 0.002
 """Noise of a step's position along each axis, as a share of the distance travelled, and what is added without motion.
-Visual-inertial tracking of phones and headsets drifts by about 1 %; this is 2 %, all axes together. With twice as much,
-jumps of 0.3 m are not found in steps of 5 m."""
+Visual-inertial tracking of phones and headsets drifts by about 1 %; this is 2 %, all axes together."""
 
 DEG_PER_M, TURN_SHARE, FLOOR_DEG = 0.3, 0.01, 0.05
 """Noise of its direction about each axis: per metre travelled, as a share of the angle turned, and what is added."""
 
 LOSS_SCALE = math.sqrt(6) * 2.0
 """Scale of the switched loss, for the squared norm of a step's six numbers, in standard deviations."""
+
+
+def step_size(step: RigidTransform) -> tuple[float, float]:
+    """Length of a step, in the session's unit, and its angle, degrees."""
+    return float(np.linalg.norm(step.translation)), math.degrees(float(np.linalg.norm(rotation_vector(step.rotation))))
 
 
 def step_sigma(length_m: Array, turn_deg: Array) -> tuple[Array, Array]:
@@ -72,9 +73,8 @@ class SequenceState:
         """Makes the state of frames at these poses, without the steps `cut`; step i is from frame i to frame i + 1."""
         neighbours = itertools.pairwise(session_from_camera)
         steps = tuple(first.inverse().compose(second) for first, second in neighbours)
-        length_m = np.array([scale * np.linalg.norm(step.translation) for step in steps])
-        turn_deg = np.array([math.degrees(float(np.linalg.norm(rotation_vector(step.rotation)))) for step in steps])
-        sigma = np.repeat(np.stack(step_sigma(length_m, turn_deg), axis=1), 3, axis=1)
+        length, turn_deg = np.array([step_size(step) for step in steps]).reshape(-1, 2).T
+        sigma = np.repeat(np.stack(step_sigma(scale * length, turn_deg), axis=1), 3, axis=1)
         sigma[list(cut)] = np.inf
         frames = tuple(pose.inverse() for pose in world_from_camera)
         return SequenceState(frames, steps, scale, scale_is_free, sigma)
@@ -120,14 +120,11 @@ class SequenceState:
         """Difference (F - 1, 6) of each step from the session's, in standard deviations."""
         return np.array([self._error(i) for i in range(len(self.steps))]).reshape(-1, 6) / self.sigma
 
-    def weights(self) -> Array:
-        """Robust weight (F - 1,) of each step, 0 to 1."""
-        return switched_weight((self.residuals() ** 2).sum(axis=1), LOSS_SCALE)
-
     def equations(self) -> tuple[Array, Array]:
         """See GroupState."""
         matrix, gradient = np.zeros((self.size, self.size)), np.zeros(self.size)
-        residuals, weights = self.residuals(), self.weights()
+        residuals = self.residuals()
+        weights = switched_weight((residuals**2).sum(axis=1), LOSS_SCALE)
         for i, (residual, weight) in enumerate(zip(residuals, weights, strict=True)):
             jacobian = self._jacobian_of_error(i) / self.sigma[i][:, None]
             matrix += weight * jacobian.T @ jacobian

@@ -20,7 +20,7 @@ from ..judge.evidence import findable_count, hull_share
 from ..judge.references import moved_matches, without
 from ..pairs.stationary import StationaryOptions
 from ..pose.generalized import CameraMatches
-from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, false_alarms, format_false_alarms
+from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, MIN_MATCHES, PnpOptions, false_alarms, format_false_alarms
 from ..rejection import Rejection, RejectionReason
 from ..structure.match import MatchOptions, search
 from ..structure.model import PointMatches, ScaleSource
@@ -29,16 +29,13 @@ INLIER_PX = PnpOptions().inlier_px
 """Largest reprojection error of an inlier, as for one photograph."""
 
 MIN_FOUND_SHARE = 0.08
-"""Least share of inliers among the points inside the images, or among the photographs' features if they are fewer. Of
-200 photographs with right poses the lowest was 0.10; wrong poses by chance or repetition mostly had 0.01."""
+"""Least share of inliers among the points inside the images, or among the photographs' features if they are fewer."""
 
 ENOUGH_INLIERS = 100
-"""So many inliers are enough for any share: with many references the structure extends far beyond one photograph.
-Repetition has supported wrong poses with at most 23."""
+"""So many inliers are enough for any share: with many references the structure extends far beyond one photograph."""
 
 MIN_HULL_SHARE = 0.04
-"""Least share of an image covered by the convex hulls of the inliers. On the same photographs the lowest of right poses
-was 0.08; a repeated floor tile with 16 inliers had 0.03."""
+"""Least share of an image covered by the convex hulls of the inliers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,17 +119,14 @@ class PosedImage:
         )
 
 
-def matched_images_of(images: Sequence[GroupImage]) -> tuple[Array, list[MatchedImage]]:
-    """Returns the photographs that have matches, in one world, and that world's origin (3,), metres."""
+def matched_images_of(images: Sequence[GroupImage]) -> list[MatchedImage]:
+    """Returns the photographs that have matches, in one world: that of the first one."""
     with_matches = [
         (i, image, image.answer.support)
         for i, image in enumerate(images)
         if image.answer.support is not None and len(image.answer.support.matches) and not _is_of_network(image.answer)
     ]
-    if not with_matches:
-        return np.zeros(3), []
-    origin = with_matches[0][2].origin
-    return origin, [_matched_image(i, image, support, origin) for i, image, support in with_matches]
+    return [_matched_image(i, image, support, with_matches[0][2].origin) for i, image, support in with_matches]
 
 
 def _matched_image(index: int, image: GroupImage, support: Support, origin: Array) -> MatchedImage:
@@ -164,6 +158,13 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
 def priors_of(images: Sequence[GroupImage], origin: Array) -> dict[int, Priors]:
     """Priors of each photograph that has some, by index, in a world with this origin (3,)."""
     return {i: image.priors.shifted(-origin) for i, image in enumerate(images) if image.priors}
+
+
+def too_few_matches(matched_images: Sequence[MatchedImage], noun: str) -> Rejection | None:
+    """Returns the rejection of a group with too few matches in all of its photographs together."""
+    total = sum(len(it.matches) for it in matched_images)
+    message = f"{total} 2D-3D matches in {len(matched_images)} {noun}, {MIN_MATCHES} needed"
+    return Rejection(RejectionReason.TOO_FEW_MATCHES, message) if total < MIN_MATCHES else None
 
 
 def rejection_without_matches(images: Sequence[GroupImage]) -> Rejection:
@@ -211,21 +212,16 @@ def _agreeing(matched: Sequence[PosedImage]) -> str:
 def group_log10_false_alarms(matched: Sequence[PosedImage]) -> float:
     """`pnp.log10_false_alarms` of all matches, with the largest chance of an inlier of any photograph."""
     disc = INLIER_PX**2
-    expected = []
-    for guided in (False, True):
-        total = sum(int((it.matches.guided == guided).sum()) for it in matched)
-        agreeing = sum(int((it.inliers & (it.matches.guided == guided)).sum()) for it in matched)
-        areas = [_searched_area(it, guided) for it in matched]
-        expected.append(false_alarms(total, agreeing, disc / max(min(areas), disc)))
-    return min(expected)
-
-
-def _searched_area(matched: PosedImage, guided: bool) -> float:
-    """Area in which a match was searched, in square pixels divided by pi."""
-    if guided:
-        return matched.matches.radius_px**2
-    camera = matched.source.query.camera
-    return camera.width_px * camera.height_px / np.pi
+    guided = np.concatenate([it.matches.guided for it in matched])
+    inliers = np.concatenate([it.inliers for it in matched])
+    cameras = [it.source.query.camera for it in matched]
+    # Areas in which a match was searched, square pixels divided by pi.
+    of_image = min(it.width_px * it.height_px / np.pi for it in cameras)
+    near_point = min(it.matches.radius_px**2 for it in matched)
+    return min(
+        false_alarms(int(chosen.sum()), int((inliers & chosen).sum()), disc / max(area, disc))
+        for chosen, area in ((~guided, of_image), (guided, near_point))
+    )
 
 
 def _is_of_network(answer: Answer) -> bool:

@@ -5,9 +5,9 @@ What `adjust` minimizes for one photograph, summed over those of a group,
     min  sum_f sum_obs rho(|r_o|^2 / sigma_o^2) + xi^T C^-1 xi + (cost of the group's parameters),
 
 where the references xi are common to the photographs that use them, and C is that of `pose_problem`, relative to the
-place of the last photograph. Each photograph has its own points, which are eliminated photograph by photograph; the
-rest is a dense system of the references and the group's parameters, whose cost is zero for a rig and that of the
-tracked steps for a sequence (see `drift`). Soft priors that agree with the photographs add their terms.
+place of the last photograph. Each photograph has its own points, which are eliminated; the rest is a dense system of
+the references and the group's parameters, whose cost is zero for a rig and that of the tracked steps for a sequence
+(see `drift`). Soft priors that agree with the photographs add their terms.
 """
 
 from collections.abc import Mapping, Sequence
@@ -92,7 +92,7 @@ def adjust_jointly(
     """
     problem = GroupProblem(matched_images, matches, state, priors)
     point = minimize(problem, problem.start, STEPS) if problem.blocks else problem.start
-    points = {block.image: (problem.chosen[i], point.points[i]) for i, block in enumerate(problem.blocks)}
+    points = {block.image: (block.chosen, moved) for block, moved in zip(problem.blocks, point.points, strict=True)}
     matched = []
     for source, its_matches in zip(matched_images, matches, strict=True):
         x_in_world = source.structure.x_in_world

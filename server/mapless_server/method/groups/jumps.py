@@ -1,8 +1,8 @@
 """Jumps of a device's tracking: steps of its session that the photographs contradict.
 
-A device that relocalizes or loses its tracking moves its session at once, by centimetres or by kilometres. Where two
-photographs are localized alone, the step between their poses is compared with the tracked one: the difference e, of
-position and rotation, has a covariance from the poses' own and from the drift of the steps between. A pair with
+A device that relocalizes or loses its tracking moves its session at once. Where two photographs are localized alone,
+the step between their poses is compared with the tracked one: the difference e, of position and rotation, has a
+covariance from the poses' own and from the drift of the steps between. A pair with
 
     m^2 = e^T C^-1 e > conflict_threshold(6)
 
@@ -27,7 +27,7 @@ from mapless.geometry import Array, RigidTransform, cross_matrix
 
 from ..bundle.priors import conflict_threshold
 from ..optim.optimize import rotation_vector
-from .drift import step_sigma
+from .drift import step_sigma, step_size
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,7 @@ class Jump:
 
 
 OWN_INFLATION = 2.0
-"""Factor on the standard deviations of the photographs' own poses. In places that no constant was fitted on, errors are
-up to this many times as large as their standard deviations say."""
+"""Factor on the standard deviations of the photographs' own poses, which errors exceed in unseen places."""
 
 LEFT_OUT_COST = 1.5
 """Cost of leaving out a pose, in thresholds; more than one jump and less than two."""
@@ -203,7 +202,6 @@ class _Links:
             for k in range(a, b):
                 levers[row, k] = np.linalg.norm(session[b].translation - session[k + 1].translation)
         moves = [first.inverse().compose(second) for first, second in pairwise(session)]
-        lengths = [(np.linalg.norm(it.translation), _angle_deg(it.rotation)) for it in moves]
         return _Links(
             np.array(frames),
             np.array([i for i, _ in pairs], np.intp),
@@ -212,7 +210,7 @@ class _Links:
             np.array(tracked).reshape(-1, 3),
             np.array(turn).reshape(-1, 3),
             OWN_INFLATION**2 * np.array(covariances).reshape(-1, 6, 6),
-            np.array(lengths).reshape(-1, 2),
+            np.array([step_size(it) for it in moves]).reshape(-1, 2),
             levers,
         )
 
@@ -250,7 +248,3 @@ class _Links:
         shift_m = float(np.linalg.norm(self.shift[row] - scale * self.tracked[row]))
         turn_deg = math.degrees(float(np.linalg.norm(self.turn[row])))
         return Jump(int(self.frames[i]), int(self.frames[j]), shift_m, turn_deg)
-
-
-def _angle_deg(rotation: Array) -> float:
-    return math.degrees(float(np.linalg.norm(rotation_vector(rotation))))

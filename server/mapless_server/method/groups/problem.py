@@ -114,6 +114,7 @@ class ImageBlock:
 
     Attributes:
         image: index of the photograph in the group.
+        chosen: (P_b,) indices of its points in the photograph's structure.
         problem: the cost and its derivatives.
         references: (V - 1,) index of each of its references in the group; the last camera is the photograph.
         level_px: noise of its structure, pixels.
@@ -121,6 +122,7 @@ class ImageBlock:
     """
 
     image: int
+    chosen: NDArray[np.intp]
     problem: BundleProblem
     references: NDArray[np.intp]
     level_px: float
@@ -160,7 +162,6 @@ class GroupProblem(Generic[S]):
     Attributes:
         start: the initial values.
         blocks: one for each photograph with matches.
-        chosen: for each block, the indices (P_b,) of its points in the photograph's structure.
         priors: priors on the photographs' poses, by index.
     """
 
@@ -173,15 +174,10 @@ class GroupProblem(Generic[S]):
     ) -> None:
         self.priors = priors or {}
         self._references: dict[str, tuple[int, PosedView]] = {}
-        self.blocks: list[ImageBlock] = []
-        self.chosen: list[NDArray[np.intp]] = []
-        points: list[Array] = []
         parts = [part_of(source, its, state) for source, its in zip(matched_images, matches, strict=True)]
         parts = [part for part in parts if len(part.chosen)]
-        for part, times in zip(parts, times_used(parts), strict=True):
-            self.chosen.append(part.chosen)
-            points.append(part.source.structure.x_in_world[part.chosen])
-            self.blocks.append(self._block(part, times))
+        self.blocks = [self._block(part, times) for part, times in zip(parts, times_used(parts), strict=True)]
+        points = [part.source.structure.x_in_world[part.chosen] for part in parts]
         references = Poses.of(reference.world_from_camera for _, reference in self._references.values())
         self.start = Point(references, tuple(points), state)
         self.information = self._reference_information() if self.blocks else np.zeros((0, 0))
@@ -199,7 +195,7 @@ class GroupProblem(Generic[S]):
         references = np.array([self._index(it) for it in source.references])
         planes = None if structure.planes is None else structure.planes[part.chosen]
         problem = BundleProblem.of(observations, start.poses[:-1], ADJUST.loss_scale_sigma, planes)
-        return ImageBlock(source.image, problem, references, structure.noise.level_px, depth_m)
+        return ImageBlock(source.image, part.chosen, problem, references, structure.noise.level_px, depth_m)
 
     def _index(self, reference: PosedView) -> int:
         """Index of a reference in the group."""

@@ -14,7 +14,7 @@ from mapless.geometry import Array, RigidTransform, cross_matrix
 from ..bundle.priors import PriorCheck
 from ..optim.optimize import covariance_in_world, perturbed
 from ..pose.generalized import inlier_count, rig_ransac
-from ..pose.pnp import MIN_MATCHES, PnpOptions
+from ..pose.pnp import PnpOptions
 from ..rejection import Rejection, RejectionReason
 from .images import (
     GroupImage,
@@ -24,6 +24,7 @@ from .images import (
     matched_images_of,
     priors_of,
     rejection_without_matches,
+    too_few_matches,
 )
 from .joint import adjust_in_rounds
 from .problem import GroupState
@@ -92,9 +93,12 @@ def solve_rig(
     A rejection is that of the image that reached the latest stage, if none has matches; TOO_FEW_MATCHES; PNP_FAILED if
     no pose has four inliers; or GATE.
     """
-    origin, matched_images = matched_images_of(images)
+    matched_images = matched_images_of(images)
     if not matched_images:
         return rejection_without_matches(images)
+    if few := too_few_matches(matched_images, "images"):
+        return few
+    origin = matched_images[0].origin
     start = _start(matched_images, rig_from_camera)
     if isinstance(start, Rejection):
         return start
@@ -119,10 +123,6 @@ def _start(
 ) -> RigidTransform | Rejection:
     """Returns the pose with most inliers, from generalized PnP or from the own pose of an image."""
     cameras = [it.camera_matches(rig_from_camera[it.image]) for it in matched_images]
-    total = sum(map(len, cameras))
-    if total < MIN_MATCHES:
-        message = f"{total} 2D-3D matches in {len(cameras)} images, {MIN_MATCHES} needed"
-        return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
     found = rig_ransac(cameras, PNP)
     candidates = [] if found is None else [found]
     candidates += [
@@ -130,6 +130,6 @@ def _start(
     ]
     counts = [inlier_count(cameras, pose, PNP.inlier_px) for pose in candidates]
     if max(counts, default=0) < 4:
-        message = f"no pose of the rig explains more than {max(counts, default=0)} of {total} matches"
+        message = f"no pose of the rig explains more than {max(counts, default=0)} of {sum(map(len, cameras))} matches"
         return Rejection(RejectionReason.PNP_FAILED, message)
     return candidates[int(np.argmax(counts))]

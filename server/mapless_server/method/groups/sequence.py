@@ -18,7 +18,6 @@ from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import PriorCheck, Priors
 from ..optim.optimize import covariance_in_world
-from ..pose.pnp import MIN_MATCHES
 from ..rejection import Rejection, RejectionReason
 from .drift import SequenceState, world_from_session_at
 from .images import (
@@ -29,6 +28,7 @@ from .images import (
     matched_images_of,
     priors_of,
     rejection_without_matches,
+    too_few_matches,
 )
 from .joint import JointEstimate, adjust_in_rounds
 from .jumps import Jump
@@ -38,12 +38,11 @@ from .trust import trust_of_group
 SHOULD_SHOW, LEAST_NEAR = 15, 3
 """The last photograph, not localized alone, contradicts the pose that it is tracked to if so many points should be
 visible, or are matched, and fewer of its matches are near them, within `LOOSE_PX` and three standard deviations of the
-pose. Of 14 such photographs 13 had three and more at their true poses; by chance a hundred matches have 0.2."""
+pose."""
 
 INDEPENDENT = 2.0
 """Photographs of a sequence count as at most so many independent ones in the covariance of a pose: they share
-references, and with them points and their errors. Without this bound a third of the poses among rows of lockers lay
-within their 68 % radii, with it four in five; elsewhere little changes."""
+references, and with them points and their errors."""
 
 MAX_SCALE_SIGMA = 0.15
 """Largest relative standard deviation of an accepted scale."""
@@ -91,16 +90,15 @@ def solve_sequence(
     if the scale is unknown and the session moves too little to determine it, or jumps; or GATE, also if the tracking
     jumps and the frames after it are not localized.
     """
-    origin, matched_images = matched_images_of(images)
+    matched_images = matched_images_of(images)
     if not matched_images:
         return rejection_without_matches(images)
+    origin = matched_images[0].origin
     session = Session(tuple(session_from_camera), estimate_scale, priors_of(images, origin), unit)
     if estimate_scale and not session.moves:
         return Rejection(RejectionReason.SCALE_UNRELIABLE, "the session does not move: its unit cannot be determined")
-    total = sum(len(it.matches) for it in matched_images)
-    if total < MIN_MATCHES:
-        message = f"{total} 2D-3D matches in {len(matched_images)} frames, {MIN_MATCHES} needed"
-        return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
+    if few := too_few_matches(matched_images, "frames"):
+        return few
     found = _estimated(matched_images, session)
     if isinstance(found, Rejection):
         return found

@@ -1,7 +1,8 @@
 """Initial poses of a sequence: from the photographs localized alone and the tracking between them, cut at its jumps.
 
-If no photograph is localized alone, the initial world_from_session is found from the matches of all (generalized PnP,
-the whole sequence as one camera).
+Each frame gets its own pose, or one tracked from the nearest frame of its part that has one. If no photograph is
+localized alone, the initial world_from_session is found from the matches of all (generalized PnP, the whole sequence as
+one camera).
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,6 @@ CHECK_TRACKING = Hint(
     "The tracked poses contradict the photographs: check that session_from_camera is camera-to-session (not its "
     "inverse), in the axes that the request names, and in metres (or set estimate_session_scale).",
 )
-
 
 PNP = PnpOptions()
 """Options of the pose solvers; `MIN_MATCHES` holds for all frames together."""

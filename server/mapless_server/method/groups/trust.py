@@ -58,12 +58,11 @@ def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[floa
 
 def supporters_of_group(matched: Sequence[PosedImage]) -> list[Supporters]:
     """The references that support the joint poses of photographs."""
-    return [
-        Supporters(
-            [it.name for it in posed.source.references], posed.inliers_by_reference(), posed.source.reference_error_px
-        )
-        for posed in matched
-    ]
+    found = []
+    for it in matched:
+        names, error_px = [r.name for r in it.source.references], it.source.reference_error_px
+        found.append(Supporters(names, it.inliers_by_reference(), error_px))
+    return found
 
 
 def _distance_m(matched: Sequence[PosedImage]) -> float:
@@ -77,10 +76,8 @@ def _distance_m(matched: Sequence[PosedImage]) -> float:
 
 def _matches_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
     """`evidence.disagreement_of_matches` for all photographs together."""
-    cameras = []
-    for it, mounting in zip(matched, _mounting(matched), strict=True):
-        seen = it.matches.unguided().seen(it.source.query, it.source.structure.x_in_world)
-        cameras.append(CameraMatches(seen, mounting))
+    seen = [it.matches.unguided().seen(it.source.query, it.source.structure.x_in_world) for it in matched]
+    cameras = list(map(CameraMatches, seen, _mounting(matched)))
 
     def half(random: np.random.Generator) -> list[NDArray[np.bool_]]:
         return [np.asarray(random.permutation(len(it.seen)) % 2 == 0) for it in cameras]
@@ -90,22 +87,20 @@ def _matches_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
 
 def _references_apart(matched: Sequence[PosedImage], distance_m: float) -> float:
     """`evidence.disagreement_of_references` for all photographs; a reference is in the same half for all of them."""
-    cameras, owners, keypoints = [], [], []
+    votes = [votes_of(it.source) for it in matched]
+    cameras = list(map(CameraMatches, [it.seen for it in votes], _mounting(matched)))
     names: dict[str, int] = {}
-    for it, mounting in zip(matched, _mounting(matched), strict=True):
-        source = it.source
-        votes = votes_of(source)
-        number = np.array([names.setdefault(r.key, len(names)) for r in source.references], np.intp)
-        cameras.append(CameraMatches(votes.seen, mounting))
-        owners.append(number[votes.reference])
-        keypoints.append(votes.keypoint)
+    owners = []
+    for it, its_votes in zip(matched, votes, strict=True):
+        number = np.array([names.setdefault(r.key, len(names)) for r in it.source.references], np.intp)
+        owners.append(number[its_votes.reference])
     counts = np.bincount(np.concatenate(owners), minlength=len(names))
 
     def half(random: np.random.Generator) -> list[NDArray[np.bool_]]:
         in_first = half_of_references(counts, random)
         return [np.asarray(in_first[it]) for it in owners]
 
-    return _median_disagreement(cameras, half, distance_m, keypoints)
+    return _median_disagreement(cameras, half, distance_m, [it.keypoint for it in votes])
 
 
 def _epipolar_share(matched: PosedImage) -> float:

@@ -1,10 +1,10 @@
-"""Levenberg-Marquardt and robust losses: `minimize` for one problem, `minimize_each` for many small ones at once.
+"""Least squares: Levenberg-Marquardt, robust losses, and small motions of poses.
 
-A step solves the linearized problem with its diagonal enlarged by a relative damping. A step that lowers the cost is
-accepted and the damping is reduced; any other, also one that cannot be computed, is repeated with more damping. So the
-cost never rises, and a start whose cost is NaN is returned as it is.
-
-Each problem solves its own normal equations: dense ones (`damped_step`), or with the points eliminated (see `bundle`).
+`minimize` solves one problem, `minimize_each` many small ones at once. A step solves the linearized problem with its
+diagonal enlarged by a relative damping. A step that lowers the cost is accepted and the damping is reduced; any other,
+also one that cannot be computed, is repeated with more damping. So the cost never rises, and a start whose cost is NaN
+is returned as it is. Each problem solves its own normal equations: dense ones (`damped_step`), or with the points
+eliminated (see `bundle`).
 
 Robust losses rho(s) of a squared residual s, with a scale c; both in standard deviations.
 
@@ -17,12 +17,9 @@ All are s for small s. For large s, soft L1 grows like the residual, and Cauchy'
 influence of outliers vanishes. The switched loss (Geman and McClure's) is that of a switch variable 0 <= t <= 1 for
 each residual, min_t t^2 s + (1 - t)^2 c^2 (Suenderhauf and Protzel 2012): an outlier costs c^2, however large it is.
 The weights are those of iteratively reweighted least squares: the gradient of a sum of losses is 2 sum rho'(s) J^T r.
-(As in `scipy.optimize.least_squares`, with f_scale = c.)
 
-An array "in columns" has its long axis last, (..., N) instead of (N, ...): many small matrices as few long rows. NumPy
-computes with these several times as fast.
-
-Small motions of poses, and the coordinates in which errors and covariances are given.
+An array "in columns" has its long axis last, (..., N) instead of (N, ...): many small matrices as few long rows, with
+which NumPy computes several times as fast.
 
 A pose error is given as d = (x, y, z), the shift of the camera's centre c, and r = (rx, ry, rz), a rotation about the
 fixed axes of the world (ROS's order):
@@ -33,9 +30,8 @@ Solvers perturb camera_from_world = [R | t] from the left instead, with a shift 
 
     [R | t]' = Exp(v, w) [R | t],    so that to first order    d = -R_wc v,    r = -R_wc w.
 
-This moves the camera about its own centre, so no lever arm appears. Other conventions (t' = t + v with R' = Exp(w) R,
-or with R' = R Exp(w)) have a lever arm as long as the camera is far from the world's origin. Derivatives: Sola, Deray,
-Atchuthan 2018, "A micro Lie theory".
+This moves the camera about its own centre, so no lever arm appears. Derivatives: Sola, Deray, Atchuthan 2018, "A micro
+Lie theory".
 """
 
 import math
@@ -89,12 +85,16 @@ def covariance_in_world(covariance: Array, world_from_camera: RigidTransform) ->
 
 
 def world_covariance(information: Array, world_from_camera: RigidTransform) -> Array:
-    """The same from the information (6, 6), the inverse covariance, of a left perturbation (v, w) of camera_from_world.
-
-    Directions without information are left out (pseudo-inverse).
-    """
+    """The same from the information (6, 6), its inverse; directions without information are left out."""
     covariance = np.asarray(np.linalg.pinv(information, hermitian=True), np.float64)
     return covariance_in_world(covariance, world_from_camera)
+
+
+def cross_matrices(vectors: Array) -> Array:
+    """The matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
+    matrices = np.zeros((len(vectors), 3, 3))
+    matrices[:, [2, 0, 1], [1, 2, 0]], matrices[:, [1, 2, 0], [2, 0, 1]] = vectors, -vectors
+    return matrices
 
 
 def motion_jacobian(x_in_camera: Array) -> Array:
@@ -111,7 +111,7 @@ def motion_jacobian(x_in_camera: Array) -> Array:
 def pose_columns(ideal: Array, focal: Array, inverse_depth: Array) -> Array:
     """Derivative (2, 6, M) of projections by a left perturbation of camera_from_world, in the unit of focal lengths.
 
-    Of points that are seen at x / z, y / z (2, M), of inverse depths (M,); `focal` is (2, M) or (2, 1).
+    The points are seen at `ideal` = x / z, y / z (2, M); `focal` is (2, M) or (2, 1), the inverse depths (M,).
     """
     (u, v), (fx, fy) = ideal, focal
     jacobian = np.empty((2, 6, len(u)))
@@ -139,6 +139,9 @@ E = TypeVar("E")
 
 LOWERED = 0.1
 """Factor on the damping after an accepted step."""
+
+MAX_DAMPING = 1e6
+"""Minimizing stops beyond it: the steps are then too short to matter."""
 
 LEAST_DIAGONAL = 1e-12
 """Added to the diagonal before it is damped: an unknown that is not determined stays where it is."""
@@ -170,18 +173,16 @@ class MinimizeOptions:
         damping: initial value; small, since the Gauss-Newton step is nearly right within an inlier threshold of the
             minimum.
         raised_by: factor on the damping after a rejected step.
-        max_damping: stop beyond it; the steps are then too short to matter.
     """
 
     iterations: int
     min_decrease: float
     damping: float = 1e-4
     raised_by: float = 10.0
-    max_damping: float = 1e6
 
     def __post_init__(self) -> None:
         check_bounds(self, "iterations", at_least=0)
-        check_bounds(self, "min_decrease damping max_damping", above=0)
+        check_bounds(self, "min_decrease damping", above=0)
         check_bounds(self, "raised_by", above=1)
 
 
@@ -206,7 +207,7 @@ def minimize(
         candidate_cost = math.nan if candidate is None else problem.cost(candidate)
         if candidate is None or not candidate_cost < cost:
             damping *= options.raised_by
-            if damping > options.max_damping:
+            if damping > MAX_DAMPING:
                 break
             continue
         converged = cost - candidate_cost < options.min_decrease * cost or is_near(x, candidate, equations)
@@ -217,10 +218,7 @@ def minimize(
 
 
 def minimize_each(
-    cost: Callable[[Array], Array],
-    linearize: Callable[[Array], tuple[Array, Array]],
-    start: Array,
-    iterations: int,
+    cost: Callable[[Array], Array], linearize: Callable[[Array], tuple[Array, Array]], start: Array, iterations: int
 ) -> Array:
     """Finds minima of many independent problems of three unknowns, each with its own damping, from points (3, P).
 
@@ -300,10 +298,7 @@ def rows(values: Array) -> Array:
 
 
 def take(values: Array, index: NDArray[np.intp] | NDArray[np.bool_]) -> Array:
-    """Columns (..., M) of values (..., N) at indices (M,) or where a mask (N,) is true.
-
-    Indexing takes five times as long.
-    """
+    """Columns (..., M) of values (..., N) at indices (M,) or where a mask (N,) is true, faster than indexing."""
     return np.take(values, np.flatnonzero(index) if index.dtype == bool else index, axis=-1)
 
 

@@ -1,14 +1,10 @@
 """Whether two references agree with their poses, by matches that the poses took no part in.
 
-References are matched along the epipolar lines of their poses, so what remains of the matches says nothing of these: a
-pair with wrong poses has few matches, like one that shows nothing in common. The evidence is taken before: matches that
-are distinct by their descriptors, and that one fundamental matrix, estimated from them alone, explains. If there are
-enough, the poses must satisfy them: their distance from the epipolar lines of the poses is the error of the pair. A
-repeated pattern gives such matches, too, but then a good part of the others satisfies poses that are right. Where the
-poses place most points behind the cameras, no distance is small enough: the epipolar lines of a camera that moves
-ahead, and of the same one moving back, are the same.
-
-The error does not depend on the unit of length, nor on the choice of the world's axes.
+References are matched along the epipolar lines of their poses, so what remains of the matches says nothing of these.
+The evidence is taken before: matches that are distinct by their descriptors, and that one fundamental matrix, estimated
+from them alone, explains. If there are enough, the poses must satisfy them: their distance from the epipolar lines of
+the poses is the error of the pair. A repeated pattern gives such matches, too, but then a good part of the others
+satisfies poses that are right. Where the poses place most points behind the cameras, no distance is small enough.
 """
 
 import numpy as np
@@ -18,8 +14,7 @@ from ..features.views import Matches, PosedView
 from .epipolar import BEHIND_SHARE, MIN_MATCHES, QUICK_ITERATIONS, PosedMatches, fundamental_inliers
 
 MAX_ERROR_PX = 3.0
-"""Largest median error of a pair that agrees, pixels of an image whose longer side is 1024. Good poses give 0.1
-(surveyed) to 0.8 px (motion capture, a rolling shutter); a phone's tracking up to two. Wrong conventions give tens."""
+"""Largest median error of a pair that agrees, pixels of an image whose longer side is 1024."""
 
 STATIONARY_PX = 35.0
 """The same for two references at one place, where only the rotation is compared: a camera turned by hand or on a tripod
@@ -43,14 +38,9 @@ def thinned(matches: Matches) -> Matches:
 def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> float | None:
     """Error of a pair: median distance of consistent matches from satisfying the poses; None if they do not show it.
 
-    Args:
-        first: a reference.
-        second: another one.
-        matches: (M, 2) distinct matches of both, that have not been filtered by the poses.
-
-    Returns:
-        The median distance (see `epipolar`), pixels of an image whose longer side is 1024; the largest possible if most
-        points are behind the cameras. For references at one place, relative to `STATIONARY_PX`.
+    The matches (M, 2) are distinct ones that have not been filtered by the poses. The distance (see `epipolar`) is in
+    pixels of an image whose longer side is 1024; the largest possible if most points are behind the cameras. For
+    references at one place it is relative to `STATIONARY_PX`.
     """
     if len(matches) < MIN_MATCHES:
         return None

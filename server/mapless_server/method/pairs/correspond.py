@@ -1,13 +1,9 @@
-"""Correspondences: matches of keypoints between photographs.
+"""Correspondences: matches of keypoints between photographs, without those of what is fixed to the camera.
 
 Matches between references are in `pair`. Matches of the query with each reference come from descriptors alone, or from
-a network that compares all keypoints of both photographs: implementations of `QueryMatching`. Where such a network is
-slow, it matches only the references with the most matches again, and pairs of references ahead of the queries:
-`PairMatching`.
-
-How two photographs are matched is in `matching`.
-
-Matches without those of what is fixed to the camera. What depends on the references alone is cached for them.
+a network that compares all keypoints of both photographs: implementations of `QueryMatching` (see `features.matching`).
+Where such a network is slow, it matches only the references with the most matches again, and pairs of references ahead
+of the queries: `PairMatching`. What depends on the references alone is cached for them.
 """
 
 import time
@@ -91,14 +87,9 @@ def references_without_fixed(
     options: StationaryOptions,
     cache: LruCache[object],
 ) -> ReferencesWithoutFixed | None:
-    """Finds what is fixed to the cameras of references; None where no pair shows anything.
+    """Finds what is fixed to the cameras of references, by the matches of their pairs; None where no pair shows it.
 
-    Args:
-        references: the references.
-        pairs: their matches, by the references' indices.
-        keys: the pairs' keys, which determine their matches.
-        options: options of finding it.
-        cache: by the references' keys and what else the results depend on.
+    The pairs are given by the references' indices; their keys determine their matches, and with them the cached result.
     """
     if not any(len(it.stationary) for it in pairs.values()):
         return None
@@ -129,15 +120,12 @@ def without_fixed(
         without_ignored(it, of_query, fixed.of_reference[reference.key])
         for it, reference in zip(query_matches, references, strict=True)
     )
-    before, after = np.zeros(len(of_query), bool), np.zeros(len(of_query), bool)
-    for matches, left in zip(query_matches, kept, strict=True):
-        before[matches[:, 0]] = True
-        after[left[:, 0]] = True
-    return of_pairs, kept, int(before.sum() - after.sum())
+    before, after = (len(np.unique(np.concatenate(it)[:, 0])) for it in (query_matches, kept))
+    return of_pairs, kept, before - after
 
 
 _PAIRS_THAT_COUNT = 10
-"""For `Matcher.pair_s`, about."""
+"""Pairs over which `Matcher.pair_s` is a mean, about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,8 +263,7 @@ class Matcher:
             query: the query.
             references: at least one.
             count: how many are wanted.
-            choose: function that returns the indices of these, in order, from indices of references and their numbers
-                of matches.
+            choose: returns the indices of these, in order, from indices of references and their numbers of matches.
             check: as in `correspond`.
 
         Returns:
@@ -318,11 +305,6 @@ class Matcher:
     def pair_matching(self) -> PairMatching | None:
         """Matches the query again with its best references, and references ahead of the queries; None: nothing does."""
         return self.pairs.pair_matching
-
-    @property
-    def stationary(self) -> StationaryOptions:
-        """Options of finding what is fixed to the cameras."""
-        return self.pairs.stationary
 
     @property
     def threads(self) -> int:

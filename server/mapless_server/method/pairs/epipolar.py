@@ -5,10 +5,8 @@ keypoints together must be moved to satisfy it, in pixels. Photographs from one 
 distance between a keypoint and the one that the rotation predicts, divided by sqrt(2) for the same reason.
 
 A camera that is turned around, or that moves the other way, satisfies the same constraint with all points behind it.
-So it is also asked how many of the points lie behind a camera.
-
-The measure does not depend on scale: poses in feet satisfy it like poses in metres. Nor does it depend on the choice of
-world axes, which changes no relative pose.
+So it is also asked how many of the points lie behind a camera. The measure depends neither on the unit of length nor on
+the choice of the world's axes.
 """
 
 import math
@@ -22,6 +20,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from ..features.views import Matches, PosedView, View
+from ..optim.optimize import cross_matrices
 
 FUNDAMENTAL_PX = 1.5
 """Largest distance from the epipolar lines of an estimated matrix; keypoints are accurate to about a pixel."""
@@ -79,11 +78,7 @@ def fundamental_inliers(
 ) -> NDArray[np.bool_]:
     """Returns whether each match (M,) satisfies one fundamental matrix, estimated from them; none if they are too few.
 
-    Args:
-        first: a photograph.
-        second: another one.
-        matches: (M, 2) of both.
-        iterations: the least and the most; None for as many as a thorough estimate takes.
+    `iterations` are the least and the most; None for as many as a thorough estimate takes.
     """
     if len(matches) < MIN_MATCHES:
         return np.zeros(len(matches), bool)
@@ -175,15 +170,6 @@ class PosedMatches:
         return _behind(self.rays[0], second, self.baseline, PARALLAX_PX / self.focal[:, 0].min(axis=-1))
 
 
-def _cross_matrices(vectors: Array) -> Array:
-    """The matrices (P, 3, 3) of the cross products with vectors (P, 3)."""
-    matrices = np.zeros((len(vectors), 3, 3))
-    for row, column, axis, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
-        matrices[:, row, column] = sign * vectors[:, axis]
-        matrices[:, column, row] = -sign * vectors[:, axis]
-    return matrices
-
-
 def _behind(first: Array, second: Array, baseline: Array, least: Array) -> Array:
     """Share (P,) of points behind a camera, of rays (P, M, 3) with an angle of at least `least` (P, 1).
 
@@ -210,7 +196,7 @@ def _relative(views: Sequence[PosedView], ends: NDArray[np.intp]) -> tuple[Array
     # The difference first: world coordinates may be millions of metres.
     baseline = np.einsum("pji,pj->pi", rotations[:, 0], centres[:, 1] - centres[:, 0])
     turned = np.swapaxes(rotations[:, 0], 1, 2) @ rotations[:, 1]
-    return baseline, turned, _cross_matrices(baseline) @ turned
+    return baseline, turned, cross_matrices(baseline) @ turned
 
 
 def _lines(lines: Array) -> Array:

@@ -121,7 +121,7 @@ def is_one_photograph(first: PosedView, second: PosedView) -> bool:
 
 
 def in_order(first: PosedView, second: PosedView) -> Pair:
-    """Returns two references in the order in which they are always matched, whichever comes first in a query.
+    """Returns two references in the order of their names, in which they are always matched.
 
     The ratio test of wide matches is not symmetric, and the order decides how sums are rounded. Names, unlike keys, are
     the same wherever the scene is stored.
@@ -202,14 +202,8 @@ class ReferencePairs:
     ) -> Matches:
         """Computes the matches of two references, given `in_order`, anew and without caching them.
 
-        Stationary ones come last: what is fixed to a camera is found by them (see `stationary`).
-
-        Args:
-            first: a reference.
-            second: another one.
-            matching: how.
-            begun: the matches that wide ones begin with, if they are known.
-            pause: see PairMatching.
+        Stationary ones come last: what is fixed to a camera is found by them (see `stationary`). `begun` are the
+        matches that wide ones begin with, if they are known; for `pause` see PairMatching.
         """
         if begun is None:
             strong = matching.is_strong

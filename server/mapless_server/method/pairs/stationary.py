@@ -42,11 +42,9 @@ class StationaryOptions:
         same_view_share: if two photographs match at the same pixels in so many of the parts where either has keypoints,
             both show the same from the same place. Parts, because a badge in a corner may have most of the keypoints.
         parts: number of columns of the grid of these parts.
-        support: number of matches, of different pairs or at different pixels, that show that a part of the image is
-            fixed.
+        support: number of matches, of different pairs or at different pixels, that show that a cell is fixed.
         cells: number of columns of the grid on which they are counted.
-        reach: cells to each side that are counted together, and ignored around a cell that is fixed; digits that change
-            are beside others that do not.
+        reach: cells to each side that are counted together, and ignored around a cell that is fixed.
     """
 
     same_px: float = 1.0
@@ -250,12 +248,11 @@ def _by_camera(references: Sequence[PosedView]) -> list[list[int]]:
     """Indices of the references of each camera."""
     groups: list[list[int]] = []
     for i, reference in enumerate(references):
-        for group in groups:
-            if reference.view.has_camera_of(references[group[0]].view):
-                group.append(i)
-                break
-        else:
+        group = next((it for it in groups if reference.view.has_camera_of(references[it[0]].view)), None)
+        if group is None:
             groups.append([i])
+        else:
+            group.append(i)
     return groups
 
 

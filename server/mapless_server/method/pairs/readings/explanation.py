@@ -60,22 +60,22 @@ class _Candidate:
     rarity: int
 
 
-def explain(views: Views, matched: Sequence[MatchedPair], given_px: float | None = None) -> Explanation:
-    """Finds the mistake whose correction makes the poses fit; `given_px` is the median error, measured if None."""
+def explain(views: Views, matched: Sequence[MatchedPair]) -> Explanation:
+    """Finds the mistake whose correction makes the poses fit."""
     sample = PairSample(views, [item for item in matched if len(item.matches)], _ENOUGH_MATCHES)
     if not sample.pairs:
         return Explanation()
-    given = _score(sample.measure())[0]
+    errors = sample.measure()
+    given_px = _score(errors)[0]
     mistakes = [*map(_of_view, CONVENTIONS), *camera_mistakes(list(sample.views.values()))]
     candidates = [_Candidate(it.text, *_score_with(sample, it.correct), it.rarity) for it in mistakes]
     candidates += _scalings(sample)
-    fitting = [it for it in candidates if it.bad_share < BAD_SHARE and it.error_px < GAIN * given]
+    fitting = [it for it in candidates if it.bad_share < BAD_SHARE and it.error_px < GAIN * given_px]
     if fitting:
         return _named(fitting)
-    text = rounding_text(sample, summary(sample.measure())[0] if given_px is None else given_px)
-    if text:
+    if text := rounding_text(sample, summary(errors)[0]):
         return Explanation(text)
-    if apart := _sessions(views, matched, sample.measure()):
+    if apart := _sessions(views, matched, errors):
         return apart
     # Perhaps a mistake was made with some photographs only.
     mixed = [(it.rarity, _mixed(sample, it)) for it in mistakes if it.rarity < STRANGE]

@@ -57,14 +57,6 @@ def is_unset(camera: Camera) -> bool:
     return min(camera.focal_x_px, camera.focal_y_px) < LEAST_FOCAL_SHARE * max(camera.width_px, camera.height_px)
 
 
-def _swapped_focal(camera: Camera) -> Camera:
-    return replace(camera, focal_x_px=camera.focal_y_px, focal_y_px=camera.focal_x_px)
-
-
-def _swapped_principal(camera: Camera) -> Camera:
-    return replace(camera, principal_x_px=camera.principal_y_px, principal_y_px=camera.principal_x_px)
-
-
 def camera_mistakes(views: Sequence[PosedView]) -> Iterator[Mistake[PosedView]]:
     """The mistakes that these views, one at least, may have; none whose correction would change next to nothing."""
     cameras = [view.view.camera for view in views]
@@ -76,9 +68,14 @@ def camera_mistakes(views: Sequence[PosedView]) -> Iterator[Mistake[PosedView]]:
             )
             yield _mistake(text, centred)
     elif _differ(cameras, lambda it: it.principal_x_px - it.principal_y_px):
-        yield _mistake("cx and cy are exchanged", _swapped_principal)
+        yield _mistake(
+            "cx and cy are exchanged",
+            lambda it: replace(it, principal_x_px=it.principal_y_px, principal_y_px=it.principal_x_px),
+        )
     if _differ(cameras, lambda it: it.focal_x_px - it.focal_y_px):
-        yield _mistake("fx and fy are exchanged", _swapped_focal)
+        yield _mistake(
+            "fx and fy are exchanged", lambda it: replace(it, focal_x_px=it.focal_y_px, focal_y_px=it.focal_x_px)
+        )
     for quarters in (1, 2, 3):
         text = f"poses and intrinsics are of images turned by {90 * quarters} degrees (EXIF orientation)"
         yield Mistake(text, turned(quarters), RARE)

@@ -21,8 +21,7 @@ _ROUNDS = 3
 def sessions_of(agrees: Mapping[tuple[K, K], bool]) -> tuple[tuple[K, ...], tuple[K, ...]] | None:
     """The photographs of the two largest sessions, the larger first; None if there are not two.
 
-    Args:
-        agrees: for each pair of photographs that can be compared, whether it agrees with their poses.
+    `agrees` is whether each pair of photographs that can be compared agrees with their poses.
     """
     links: dict[K, dict[K, int]] = {}
     for (first, second), is_good in agrees.items():
