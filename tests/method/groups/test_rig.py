@@ -173,13 +173,13 @@ def alone(inliers: int) -> Answer:
 
 def rig(*kept: int) -> RigEstimate:
     matched = [SimpleNamespace(source=SimpleNamespace(image=i), inliers=np.ones(n)) for i, n in enumerate(kept)]
-    return RigEstimate(HERE, np.eye(6), cast(Any, tuple(matched)), np.zeros(3))
+    return RigEstimate(HERE, np.eye(6), cast(Any, tuple(matched)))
 
 
 def walk(step_m: float, sigma_m: float = 0.01) -> SequenceEstimate:
     poses = tuple(RigidTransform(np.eye(3), np.array([i * step_m, 0, 0])) for i in range(5))
     covariances = np.tile(sigma_m**2 * np.eye(6), (5, 1, 1))
-    return SequenceEstimate(cast(Any, None), 0.0, poses, covariances, (), np.zeros(3))
+    return SequenceEstimate(cast(Any, None), 0.0, poses, covariances, ())
 
 
 def test_photographs_that_lose_their_inliers_reject_the_rig() -> None:

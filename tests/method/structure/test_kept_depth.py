@@ -7,7 +7,7 @@ import pytest
 from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
-from mapless_server.method.bundle.bundle import BundleProblem, bundle_of
+from mapless_server.method.bundle.bundle import free_problem
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import Features, KeptDepth, KeypointDepths, PosedView
@@ -123,9 +123,8 @@ def test_planes_are_in_the_normal_equations_as_in_the_cost() -> None:
     structure, correspondences = matched(references)
     found = with_kept_depths(structure, references, correspondences, ALWAYS)
     chosen = np.arange(len(found.x_in_world))
-    observations, start, _ = bundle_of(found.tracks, references, found, chosen)
-    assert found.planes is not None
-    problem = BundleProblem.of(observations, start.poses[:-1], 1e6, found.planes)
+    problem, start, _ = free_problem(found.tracks, references, found, chosen, 1e6)
+    assert problem.by_view.planes is not None
     start = start.moved(np.zeros((3, 6)), np.random.default_rng(0).normal(0, 0.05, start.points.shape))
     equations, step = problem.linearize(problem.at(start)), 1e-6
     for point in (0, len(chosen) - 1):

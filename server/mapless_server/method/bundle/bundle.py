@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from mapless.geometry import Array
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import cauchy_cost, solve_step, world_jacobian
-from ..structure.model import DepthPlanes, Structure
+from ..structure.model import Structure
 from ..structure.observations import Observations
 from ..structure.structure import observe
 from .normal_equations import Bundle, Linearized, NormalEquations, Poses, ViewColumns
@@ -36,8 +36,7 @@ class BundleProblem:
     Attributes:
         observations: observations of the points in all views; the views' poses are not used.
         by_view: the same sorted by view, with the motion of the query's keypoints by errors of its intrinsics, if these
-            are unknowns, and planes near which the points lie by stored depths, at the references' given poses: motions
-            of these by millimetres do not matter for depths known to centimetres.
+            are unknowns, and planes near which the points lie by stored depths, at the references' given poses.
         given: poses of the references.
         information: C^-1, (6 (V - 1), 6 (V - 1)), of the prior on the references' poses; 0 leaves them free.
         loss_scale_sigma: scale of the Cauchy loss, in standard deviations.
@@ -45,9 +44,8 @@ class BundleProblem:
         prior_weight: factor on their cost, relative to that of the observations.
         intrinsics_information: (I,) inverse variances of the prior on these errors.
         intrinsics_offset: (I,) errors of the intrinsics that are removed already; the prior's mean is minus these.
-        least_curvature: least curvature of the loss along a residual, as a share of its weight. Along a residual
-            Cauchy's loss curves less than its weight says, so below 1 steps are longer and fewer (Triggs et al.,
-            Bundle adjustment: a modern synthesis, 2000); the minimum is the same.
+        least_curvature: least curvature of the loss along a residual, as a share of its weight. Below 1 steps are
+            longer and fewer (Triggs et al., Bundle adjustment: a modern synthesis, 2000); the minimum is the same.
     """
 
     observations: Observations
@@ -60,15 +58,6 @@ class BundleProblem:
     intrinsics_information: Array = field(default_factory=lambda: np.zeros(0))
     intrinsics_offset: Array = field(default_factory=lambda: np.zeros(0))
     least_curvature: float = 1.0
-
-    @staticmethod
-    def of(
-        observations: Observations, given: Poses, loss_scale_sigma: float, planes: DepthPlanes | None = None
-    ) -> BundleProblem:
-        """The problem with free references."""
-        count = len(given.rotation)
-        by_view = ViewColumns.of(observations, count + 1, planes)
-        return BundleProblem(observations, by_view, given, np.zeros((6 * count,) * 2), loss_scale_sigma)
 
     @property
     def query_rows(self) -> slice:
@@ -137,13 +126,24 @@ class BundleProblem:
         return math.sqrt(step @ equations.pose_block[unknowns, unknowns] @ step)
 
 
-def bundle_of(
-    tracks: Tracks, views: Sequence[PosedView], structure: Structure, chosen: NDArray[np.bool_] | NDArray[np.intp]
-) -> tuple[Observations, Bundle, float]:
-    """Sets up an adjustment: observations, initial bundle and median depth of the chosen points of a structure, metres.
+def free_problem(
+    tracks: Tracks,
+    views: Sequence[PosedView],
+    structure: Structure,
+    chosen: NDArray[np.bool_] | NDArray[np.intp],
+    loss_scale_sigma: float,
+    *,
+    times_used: Array | float = 1.0,
+) -> tuple[BundleProblem, Bundle, float]:
+    """Sets up an adjustment with free references: the problem, its start, and the median depth of the points, metres.
 
-    The tracks of these points are over the views: the references, then the query.
+    The tracks of the chosen points of the structure are over the views: the references, then the query. A keypoint that
+    is used in several problems of a sum is one measurement: its variance is multiplied by their number (O,).
     """
     observations = observe(tracks, views, structure.noise)
-    bundle = Bundle(Poses.of(view.world_from_camera for view in views), structure.x_in_world[chosen])
-    return observations, bundle, float(np.median(observations.in_camera(bundle.points)[2]))
+    observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(times_used))
+    start = Bundle(Poses.of(view.world_from_camera for view in views), structure.x_in_world[chosen])
+    planes = None if structure.planes is None else structure.planes[chosen]
+    by_view, size = ViewColumns.of(observations, len(views), planes), 6 * len(views) - 6
+    problem = BundleProblem(observations, by_view, start.poses[:-1], np.zeros((size, size)), loss_scale_sigma)
+    return problem, start, float(np.median(observations.in_camera(start.points)[2]))

@@ -187,12 +187,8 @@ def accuracy_from_covariance(covariance: Array) -> Accuracy:
     shares = np.array([0.68, 0.95])
     position_68_m, position_95_m = error_radii(covariance[:3, :3], shares).tolist()
     rotation_68, rotation_95 = error_radii(covariance[3:, 3:], shares).tolist()
-    return Accuracy(
-        position_68_m=position_68_m,
-        position_95_m=TAIL_95 * position_95_m,
-        rotation_68_deg=math.degrees(rotation_68),
-        rotation_95_deg=TAIL_95 * math.degrees(rotation_95),
-    )
+    radii_deg = math.degrees(rotation_68), TAIL_95 * math.degrees(rotation_95)
+    return Accuracy(position_68_m, TAIL_95 * position_95_m, *radii_deg)
 
 
 def self_tail(count: int) -> float:
@@ -204,8 +200,7 @@ JACKKNIFE_SHARE = 0.6
 """Share of the jackknife's variance where halves count, too; alone it has to contain all of the errors."""
 
 MOST_DISAGREEMENT = 3.0
-"""Largest half of the distance between halves that counts, in 68 % radii by the jackknife. Halves further apart have
-failed, one of them at least."""
+"""Largest half of the distance between halves that counts, in 68 % radii by the jackknife; beyond, one has failed."""
 
 
 def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
@@ -213,10 +208,9 @@ def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
 
     Two independent halves have twice the variance of both together each, so their cameras are two standard deviations
     apart, and the square of half of the distance estimates the variance. The jackknife, which is linear at the pose,
-    does not see how far halves move that fit as well elsewhere. The distance of a few splits varies, and shows no
-    errors of reference poses that all references share, so a share of the jackknife's variance is added. Turning and
-    stepping aside look alike, so the whole covariance is multiplied. Errors of the intrinsics are the same in both
-    halves, so they count in full. Halves know nothing of priors: an estimate with these stays as it is.
+    does not see how far halves move that fit as well elsewhere. The distance of a few splits varies, so a share of the
+    jackknife's variance is added. Turning and stepping aside look alike, so the whole covariance is multiplied. Errors
+    of the intrinsics, the same in both halves, count in full. An estimate with priors, which halves have not, stays.
     """
     radius_m = accuracy_from_covariance(estimate.covariance).position_68_m
     if estimate.without_priors is not None or not radius_m > 0:
@@ -229,8 +223,7 @@ def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
 def _shared(estimate: PoseEstimate) -> Array:
     """The part (6, 6) of the covariance by errors of the intrinsics, which are the same in all halves of the data.
 
-    Evidence that was estimated anew, because it contradicts the intrinsics, says more than the covariance contains: no
-    more than this counts, of position and rotation.
+    Evidence that contradicts the intrinsics may say more than the covariance contains: no more than this counts.
     """
     if estimate.intrinsics is None:
         return np.zeros((6, 6))
@@ -243,8 +236,7 @@ def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
     """Lengths (P,) that a zero-mean normal vector of covariance (n, n) does not exceed with probabilities (P,).
 
     The squared length is a sum of chi-squares weighted by the eigenvalues, approximated by one scaled chi-square with
-    the same mean and variance (Satterthwaite). Exact if all eigenvalues are equal or all but one vanish, else within
-    4 %.
+    the same mean and variance (Satterthwaite): within 4 %, exact if all eigenvalues are equal or all but one vanish.
     """
     probabilities = np.asarray(probabilities, float)
     eigenvalues = np.linalg.eigvalsh(covariance).clip(min=0)

@@ -83,8 +83,8 @@ class IntrinsicsEquations:
     ) -> tuple[Array, Array]:
         """The errors (..., 4), and their covariance (..., 4, 4), which contains what matches share.
 
-        As that of a pose, it is the sum of the jackknife over references and over regions, these at the errors that are
-        found; to which come what the prior leaves and what the residuals say, for few references may agree by chance.
+        As that of a pose, it is the sum of the jackknife over references and over regions; to which come what the prior
+        leaves and what the residuals say, for few references may agree by chance.
 
         Args:
             removed: (4,) errors that are removed from the intrinsics at which the equations are linearized.
@@ -117,15 +117,13 @@ class IntrinsicsEvidence:
         given: the camera, in pixels of the processed image, with its distortion.
         sent: the same in pixels of the photograph as it was sent.
         value: (4,) each error as the photograph alone gives it, the other three held by their priors. One that is not
-            removed is too small by up to a third: it takes weight from the matches that show it.
-        sigma: (4,) standard deviations of these; they contain errors of points, reference poses and all that matches
-            share.
+            removed is too small: it takes weight from the matches that show it.
+        sigma: (4,) standard deviations of these, with all that matches share.
         prior_sigma: (4,) standard deviations of the errors without the photograph, as of a camera of its own.
         covariance: (4, 4) about zero, of the errors that remain in the intrinsics with which the pose was computed:
             what the photograph and the prior say together, uncertainty and value.
         motion: (6, 4) how the pose moves with each error: x y z rx ry rz, fixed world axes.
-        removed: (4,) the errors that were removed before the pose was computed; zeros if it is that of the intrinsics
-            as given.
+        removed: (4,) the errors that were removed before the pose was computed.
     """
 
     given: Camera

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -111,7 +111,7 @@ class ViewColumns:
         point, view: (O,) indices of each observation's point and view.
         view_count: number of views.
         focal, offset: (2, O) as in `Observations`.
-        by_intrinsics: (2, I, O_q) derivative of the last view's residuals by errors of its intrinsics.
+        by_intrinsics: (2, I, O_q) derivative of the last view's residuals by errors of its intrinsics, if unknown.
         planes: planes of the points, if any have stored depths.
     """
 
@@ -130,13 +130,6 @@ class ViewColumns:
         order = np.argsort(view, kind="stable")
         focal, offset = take(observations.focal, order), take(observations.offset, order)
         return ViewColumns(observations.point[order], view[order], view_count, focal, offset, planes=planes)
-
-    def with_keypoint_motion(self, keypoint_motion: Array) -> ViewColumns:
-        """Returns the columns with errors of the query's intrinsics as unknowns.
-
-        `keypoint_motion` is the derivative (O_q, 2, I) of its observations, in their order, in standard deviations.
-        """
-        return replace(self, by_intrinsics=np.ascontiguousarray(np.moveaxis(keypoint_motion, 0, 2)))
 
     @cached_property
     def parts(self) -> tuple[slice, ...]:

@@ -34,10 +34,10 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 
 from ..features.views import Matches, PosedView, View
-from ..optim.optimize import MinimizeOptions, minimize
+from ..optim.optimize import MinimizeOptions, columns, minimize
 from ..structure.model import PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
-from .bundle import BundleProblem, bundle_of
+from .bundle import BundleProblem, free_problem
 from .dispersion import UncertaintyOptions, disperse, dispersed_covariance
 from .estimate import PoseEstimate, PoseStage, Support
 from .intrinsics import (
@@ -60,8 +60,7 @@ LEAST_SPACING = 0.05
 
 OWN = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 DRIFT = (0.1, 0.2, 0.4, 1.0, 2.0, 4.0)
-"""Values of a and b that are tried, in units of the structure's noise; the smallest a is that of a reconstruction from
-these very photographs."""
+"""Values of a and b that are tried, in units of the structure's noise."""
 USUAL_OWN, USUAL_DRIFT, PRIOR_LOG = 0.1, 0.4, 1.5
 """Medians of the priors of a and b, log-normal and wide, and the standard deviation of their logarithms: ten references
 determine both, three do not. Reconstructions are smooth, so without evidence the poses drift."""
@@ -201,17 +200,14 @@ def pose_problem(
     query, references, structure, matches = given.query, given.references, given.structure, given.matches
     views = [*references, PosedView("", "", query, world_from_query)]
     tracks, chosen = tracks_with_query(structure, matches.point[used], matches.keypoint[used], len(references))
-    observations, start, depth_m = bundle_of(tracks, views, structure, chosen)
-    poses = start.poses[:-1]
-    planes = structure.planes[chosen] if structure.planes is not None else None
-    problem = BundleProblem.of(observations, poses, given.options.loss_scale_sigma, planes)
+    problem, start, depth_m = free_problem(tracks, views, structure, chosen, given.options.loss_scale_sigma)
     if known is not None:
         return replace(problem, information=known[0]), problem.at(replace(start, poses=known[1]))
     centres = np.array([it.world_from_camera.translation for it in references])
     observing = np.unique(tracks.view)[:-1]  # the last is the query
     focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
-    level_px = structure.noise.level_px
-    errors = pose_errors(centres, poses.rotation, world_from_query.translation, level_px, focal_px, depth_m, observing)
+    centre, level_px, rotations = world_from_query.translation, structure.noise.level_px, problem.given.rotation
+    errors = pose_errors(centres, rotations, centre, level_px, focal_px, depth_m, observing)
     there = problem.at(start)
     matrix, gradient, _ = problem.linearize(there).reduced(LEAST_DAMPING)
     own, drift = most_probable(errors, matrix, gradient)
@@ -235,7 +231,7 @@ def with_intrinsics(problem: BundleProblem, bundle: Bundle, query: View) -> tupl
     is_query = observations.tracks.view == len(problem.given.rotation)
     motion = keypoint_motion(query.camera, query.distortion, observations.pixel[:, is_query].T)
     motion = motion / observations.sigma_px[is_query, None, None]
-    by_view, none = problem.by_view.with_keypoint_motion(motion), np.zeros(4)
+    by_view, none = replace(problem.by_view, by_intrinsics=columns(motion)), np.zeros(4)
     wider = replace(problem, by_view=by_view, intrinsics_information=none, intrinsics_offset=none)
     return wider, replace(bundle, intrinsics=np.zeros(4))
 

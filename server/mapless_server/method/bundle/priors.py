@@ -182,10 +182,6 @@ class DirectionPrior:
         """Returns the prior with its variance multiplied by a factor, up to a sigma of 180 degrees (no information)."""
         return replace(self, sigma_deg=min(180.0, math.sqrt(factor) * self.sigma_deg))
 
-    def shifted(self, offset: Array) -> DirectionPrior:
-        """Returns the prior unchanged: directions do not depend on the origin."""
-        return self
-
 
 @dataclass(frozen=True, eq=False)
 class GravityPrior(DirectionPrior):
@@ -289,7 +285,8 @@ class Priors:
 
     def shifted(self, offset: Array) -> Priors:
         """Returns the priors in a world in which everything lies `offset` (3,) further."""
-        return Priors(**{prior.kind.value: prior.shifted(offset) for prior in self})  # type: ignore[arg-type]
+        position, pose = self.position and self.position.shifted(offset), self.pose and self.pose.shifted(offset)
+        return replace(self, position=position, pose=pose)
 
     def check(self, world_from_camera: RigidTransform, covariance: Array) -> tuple[PriorCheck, ...]:
         """Compares each prior with a pose that was estimated without priors and has this covariance (6, 6)."""

@@ -3,7 +3,7 @@
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle.bundle import BundleProblem, bundle_of
+from ..bundle.bundle import BundleProblem, free_problem
 from ..bundle.normal_equations import Bundle, Linearized, NormalEquations, Poses
 from ..bundle.pose_problem import LEAST_DAMPING, AdjustOptions, most_probable, pose_errors
 from ..bundle.priors import Priors
@@ -190,16 +190,11 @@ class GroupProblem(Generic[S]):
     def _block(self, part: Part, times: Array) -> ImageBlock:
         source, structure = part.source, part.source.structure
         views = [*source.references, PosedView("", "", source.query, part.world_from_camera)]
-        observations, start, depth_m = bundle_of(part.tracks, views, structure, part.chosen)
-        observations = replace(observations, sigma_px=observations.sigma_px * np.sqrt(times))
-        references = np.array([self._index(it) for it in source.references])
-        planes = None if structure.planes is None else structure.planes[part.chosen]
-        problem = BundleProblem.of(observations, start.poses[:-1], ADJUST.loss_scale_sigma, planes)
+        loss_scale = ADJUST.loss_scale_sigma
+        problem, _, depth_m = free_problem(part.tracks, views, structure, part.chosen, loss_scale, times_used=times)
+        known = self._references
+        references = np.array([known.setdefault(it.key, (len(known), it))[0] for it in source.references])
         return ImageBlock(source.image, part.chosen, problem, references, structure.noise.level_px, depth_m)
-
-    def _index(self, reference: PosedView) -> int:
-        """Index of a reference in the group."""
-        return self._references.setdefault(reference.key, (len(self._references), reference))[0]
 
     def _reference_information(self) -> Array:
         """Inverse covariance (6 R, 6 R) of the priors on the references' poses (see `pose_problem`).

@@ -41,8 +41,7 @@ class RigEstimate:
     Attributes:
         world_from_rig: the metric pose.
         covariance: (6, 6) of the pose, order x y z rx ry rz, fixed world axes, metres and radians.
-        matched: the images that have matches, in order.
-        origin: (3,) origin of the world of `matched`, metres; the pose is in the caller's world.
+        matched: the images that have matches, in order, in the world of the group.
         trust: 0 to 1, see `judge`.
         prior_checks: comparisons with the photographs' priors, by the photographs' index.
     """
@@ -50,7 +49,6 @@ class RigEstimate:
     world_from_rig: RigidTransform
     covariance: Array
     matched: tuple[PosedImage, ...]
-    origin: Array
     trust: float = 1.0
     prior_checks: Mapping[int, tuple[PriorCheck, ...]] = field(default_factory=dict)
 
@@ -113,9 +111,7 @@ def solve_rig(
         return doubt
     world_from_rig = estimate.state.rig_from_world.inverse()
     covariance = covariance_in_world(estimate.covariance, world_from_rig)
-    return RigEstimate(
-        world_from_rig.shifted(origin), covariance, estimate.matched, origin, trust, estimate.prior_checks
-    )
+    return RigEstimate(world_from_rig.shifted(origin), covariance, estimate.matched, trust, estimate.prior_checks)
 
 
 def _start(

@@ -57,8 +57,7 @@ class SequenceEstimate:
         scale_sigma: relative standard deviation of its scale; 0 where the session is metric.
         world_from_camera: metric pose of every frame, corrected for drift and jumps.
         covariances: (F, 6, 6) of these poses, order x y z rx ry rz, fixed world axes, metres and radians.
-        matched: the frames that have matches, in order.
-        origin: (3,) origin of the world of `matched`, metres; the poses are in the caller's world.
+        matched: the frames that have matches, in order, in the world of the group.
         jumps: jumps of the tracking, in order.
         trust: 0 to 1, see `judge`; of the frames since the last jump.
         prior_checks: comparisons with the frames' priors, by the frames' index.
@@ -69,7 +68,6 @@ class SequenceEstimate:
     world_from_camera: tuple[RigidTransform, ...]
     covariances: Array
     matched: tuple[PosedImage, ...]
-    origin: Array
     jumps: tuple[Jump, ...] = ()
     trust: float = 1.0
     prior_checks: Mapping[int, tuple[PriorCheck, ...]] = field(default_factory=dict)
@@ -111,7 +109,8 @@ def solve_sequence(
         if isinstance(found, Rejection):
             return found
         start, estimate = found
-    last_part = [it for it in estimate.matched if it.source.image in start.last_part]
+    since_jump = max(start.cut, default=-1) + 1
+    last_part = [it for it in estimate.matched if it.source.image >= since_jump]
     trust, rejection = _judged(estimate, last_part, coverage)
     if rejection is not None:
         cut = [it.described(unit) for it in start.jumps]
@@ -239,7 +238,6 @@ def _result(
         tuple(pose.shifted(origin) for pose in poses),
         _covariances(estimate, session.priors),
         estimate.matched,
-        origin,
         start.jumps,
         trust,
         estimate.prior_checks,

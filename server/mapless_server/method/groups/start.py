@@ -59,11 +59,6 @@ class Start:
     jumps: tuple[Jump, ...] = ()
     cut: tuple[int, ...] = ()
 
-    @property
-    def last_part(self) -> range:
-        """The frames since the last jump."""
-        return range(max(self.cut, default=-1) + 1, len(self.poses))
-
 
 @dataclass(frozen=True, eq=False)
 class Session:
@@ -96,7 +91,8 @@ class Session:
             for it in matched_images
             if it.own_pose is not None and it.own_covariance is not None
         }
-        while chain := self._chain(own):
+        known_scale = None if self.scale_is_free else 1.0
+        while chain := find_jumps(own, self.frames, known_scale):
             outvoted = [i for i in own if any(self._is_outvoted(matched[i], jump, chain, own) for jump in chain.jumps)]
             if not outvoted:
                 break
@@ -113,10 +109,6 @@ class Session:
             message = f"the session's steps contradict one another in any unit; in that of one of them, {jumps}"
             return Rejection(RejectionReason.SCALE_UNRELIABLE, message, CHECK_TRACKING)
         return self._cut(matched, {i: own[i][0] for i in chain.frames}, chain)
-
-    def _chain(self, own: Mapping[int, tuple[RigidTransform, Array]]) -> Chain | None:
-        scale = None if self.scale_is_free else 1.0
-        return find_jumps(own, self.frames, scale)
 
     def _is_outvoted(
         self, matched: MatchedImage, jump: Jump, chain: Chain, own: Mapping[int, tuple[RigidTransform, Array]]

@@ -1,9 +1,8 @@
 """Keypoints that are fixed to the camera: a bonnet, a gripper, a badge, a time stamp, a watermark.
 
-They match at the same pixels wherever the camera is. Between two references whose poses say that what is seen there
-must have moved, such matches are found; where several pairs show them, all keypoints around are ignored in the
-references of that camera, and in a photograph of it. Matches of a photograph with them would say "the pose of the
-reference", whatever else it shows.
+They match at the same pixels wherever the camera is, so they would say "the pose of the reference". Between two
+references whose poses say that what is seen there must have moved, such matches are found; where several pairs show
+them, all keypoints around are ignored in the references of that camera, and in a photograph of it.
 
 At the same pixels, poses predict far points, and those near the point that a camera moves towards. So it is asked
 whether a point at any depth in front of both cameras, up to infinity, can be seen there: with x a pixel of the first

@@ -6,7 +6,7 @@ that do not fit if errors as large as theirs come of moving every pose within it
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,26 +26,16 @@ _EXACT = 1e-8
 _FACTOR = 3.0  # between the errors that are found and those that the steps make
 
 
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """Steps of the numbers of poses; 0 where none was found.
+def steps_of(poses: Sequence[RigidTransform]) -> tuple[Array, float]:
+    """Finds the steps of positions (3,), in the poses' unit, and of matrices or quaternions; 0 where there are none.
 
-    Attributes:
-        position: (3,) of x, y and z, in the poses' unit.
-        rotation: of the numbers of rotation matrices, or of quaternions.
+    A pose that is given several times counts once.
     """
-
-    position: Array
-    rotation: float
-
-
-def steps_of(poses: Sequence[RigidTransform]) -> Steps:
-    """Finds the steps of the numbers of poses; a pose that is given several times counts once."""
     poses = list({pose.matrix().round(8).tobytes(): pose for pose in poses}.values())
     if len(poses) < LEAST_COUNT:
-        return Steps(np.zeros(3), 0.0)
+        return np.zeros(3), 0.0
     positions = np.array([pose.translation for pose in poses])
-    return Steps(np.array([_step(positions[:, axis]) for axis in range(3)]), _rotation_step(poses))
+    return np.array([_step(positions[:, axis]) for axis in range(3)]), _rotation_step(poses)
 
 
 def _step(values: Array) -> float:
@@ -86,33 +76,33 @@ def _is_of_rounded_quaternion(pose: RigidTransform, digits: int) -> bool:
 
 def rounding_text(sample: PairSample, given_px: float) -> str:
     """Names the rounded numbers if rounding gives errors like the given median of the sample's pairs; else empty."""
-    steps = steps_of([view.world_from_camera for view in sample.views.values()])
+    position, rotation = steps_of([view.world_from_camera for view in sample.views.values()])
+
+    def explain(position: Array, rotation: float) -> bool:
+        made_px, _ = summary(sample.measure(_moved(sample.views, position, rotation)))
+        return given_px <= _FACTOR * made_px
+
     parts = []
-    if steps.position.any() and _explains(sample, replace(steps, rotation=0.0), given_px):
-        names = [f"{name} to {step:.2g}" for name, step in zip("xyz", steps.position, strict=True) if step]
+    if position.any() and explain(position, 0.0):
+        names = [f"{name} to {step:.2g}" for name, step in zip("xyz", position, strict=True) if step]
         parts.append(f"the positions are rounded ({', '.join(names)})")
-    if steps.rotation and _explains(sample, replace(steps, position=np.zeros(3)), given_px):
-        parts.append(f"the rotations are rounded to {round(-math.log10(steps.rotation))} digits")
-    if not parts and steps.rotation and steps.position.any() and _explains(sample, steps, given_px):
+    if rotation and explain(np.zeros(3), rotation):
+        parts.append(f"the rotations are rounded to {round(-math.log10(rotation))} digits")
+    if not parts and rotation and position.any() and explain(position, rotation):
         parts.append("positions and rotations are rounded")
     if not parts:
         return ""
     return f"{' and '.join(parts)}: write all digits, or subtract a common origin from large coordinates first"
 
 
-def _explains(sample: PairSample, steps: Steps, given_px: float) -> bool:
-    made_px, _ = summary(sample.measure(_moved(sample.views, steps)))
-    return given_px <= _FACTOR * made_px
-
-
-def _moved(views: Mapping[int, PosedView], steps: Steps) -> dict[int, PosedView]:
+def _moved(views: Mapping[int, PosedView], position: Array, rotation: float) -> dict[int, PosedView]:
     """Views whose poses are moved by random parts of the steps, as rounding did; the same for the same views."""
     random = np.random.default_rng(len(views))
     moved = {}
     for i, view in views.items():
         pose = view.world_from_camera
-        shift = random.uniform(-0.5, 0.5, 3) * steps.position
-        turn = random.uniform(-0.5, 0.5, 3) * steps.rotation
+        shift = random.uniform(-0.5, 0.5, 3) * position
+        turn = random.uniform(-0.5, 0.5, 3) * rotation
         turned = RigidTransform(rotation_from_vector(turn) @ pose.rotation, pose.translation + shift)
         moved[i] = replace(view, world_from_camera=turned)
     return moved
