@@ -34,6 +34,7 @@ _NOT_CONNECTED_BECAUSE = _MISCONFIGURED | {
     "Socket closed": "the server closes the connection at once: all of its connections are taken, or it uses TLS "
     "(give --tls or --ca FILE; Python: tls, root_certificates), or requires a client certificate (--cert)",
     "Connection refused": f"{REFUSED} (connection refused)",
+    "timed out before receiving SETTINGS frame": "a connection is accepted, but nothing answers in time",
 }
 _BROKEN = re.compile(
     r"RST_STREAM with error code [02]\b|Stream removed|Connection reset|Broken pipe|Socket closed|Transport closed|"

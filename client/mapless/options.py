@@ -18,6 +18,8 @@ CLIENT_ID_KEY = "x-client-id"
 _TOKEN = re.compile(r"[!-~]{1,4096}", re.ASCII)
 _FIRST_RECONNECT_MS = 200
 _TIMES = ("timeout_s", "upload_timeout_s", "connect_timeout_s", "max_reconnect_s", "keepalive_s", "keepalive_timeout_s")
+_MAX_CONNECT_S = 20.0
+"""gRPC's own limit of an attempt to connect."""
 _CLIENT_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the server's log
 
 
@@ -34,8 +36,9 @@ class ConnectOptions:
             message delays the server's other callers.
         batch_count: largest number of references in such a message, so that progress is visible.
         connect_timeout_s: time in which the first connection must be made. Until a server has been reached once, a call
-            that finds none fails after it; later, calls outlive the server's absence until their deadline. By default
-            the first one does so, too.
+            that finds none, or one that accepts connections and is silent, fails after it; later, calls outlive the
+            server's absence until their deadline. By default the first one does so, too. Each attempt to connect ends
+            after this time, too, and after 20 s at most.
         max_attempts: attempts of a call while the server is away, UNAVAILABLE or lost during the answer; 1 for no
             retries at all; None for as many as the call's deadline permits. A server that sends RetryInfo, because it
             starts or is at its limit, is retried until the deadline unless this is 1.
@@ -127,6 +130,7 @@ class ConnectOptions:
         """The options in grpc's form."""
         max_message_bytes = self.max_message_mib * 2**20
         max_reconnect_ms = round(1000 * self.max_reconnect_s)
+        connect_ms = round(1000 * min(self.connect_timeout_s, _MAX_CONNECT_S))
         # Several servers behind one name share the calls; a lost server is skipped.
         config: dict[str, Any] = {"loadBalancingConfig": [{"round_robin": {}}]}
         return [
@@ -134,6 +138,7 @@ class ConnectOptions:
             ("grpc.max_receive_message_length", max_message_bytes),
             ("grpc.initial_reconnect_backoff_ms", min(_FIRST_RECONNECT_MS, max_reconnect_ms)),
             ("grpc.max_reconnect_backoff_ms", max_reconnect_ms),
+            ("grpc.min_reconnect_backoff_ms", max(connect_ms, 1)),  # after which gRPC gives up an attempt to connect
             # A server that was moved has another address; by default gRPC asks for it every 30 s.
             ("grpc.dns_min_time_between_resolutions_ms", max_reconnect_ms),
             ("grpc.use_local_subchannel_pool", 1),  # servers share their time among connections

@@ -4,6 +4,7 @@ import re
 import socket
 import ssl
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -149,6 +150,19 @@ def test_an_address_that_accepts_and_is_silent_is_named(monkeypatch: pytest.Monk
         reported = MaplessError("UNAVAILABLE", f"cannot connect to [::1]:{port}: {REFUSED} (connection refused)")
         shown = explained(reported, f"localhost:{port}", ConnectOptions(timeout_s=0.2))
     assert shown.message.startswith(f"cannot connect to {host}:{port}: a connection is accepted, but nothing answers")
+
+
+def test_a_silent_server_takes_no_longer_than_asked() -> None:
+    """It accepts a connection and sends nothing: gRPC alone waits 20 s for it."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        start_s = time.monotonic()
+        with (
+            Client(address, ConnectOptions(connect_timeout_s=1.0)) as client,
+            pytest.raises(MaplessError, match=f"cannot connect to {address}: a connection is accepted"),
+        ):
+            client.get_scene("s")
+    assert 0.5 < time.monotonic() - start_s < 10
 
 
 @pytest.mark.parametrize(

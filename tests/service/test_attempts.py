@@ -5,10 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from support.servers import CAMERA, PHOTO, RunningServer, make_scene, pose, serving
 
-from mapless import Attempt, Client
+from mapless import Attempt, Client, GroupRejected, PositionPrior, Priors
 from mapless.groups import RigImage
 from mapless_server.engine.query import Result, Tried
 
@@ -56,3 +57,13 @@ def test_each_photograph_of_a_rig_has_its_attempts(server: RunningServer) -> Non
         answer = client.localize_rig([RigImage(PHOTO, CAMERA, pose(i)) for i in range(2)], scene)
     assert [it.diagnostics.attempts for it in answer.images] == [SEEN, SEEN]
     assert counts(server) == [2, 2, 2]
+
+
+def test_attempts_of_a_round_that_is_not_answered_count(server: RunningServer) -> None:
+    """A rejected rig with soft priors is localized a second time, with references of the whole scene."""
+    near = Priors(position=PositionPrior(pose(0).translation, covariance_m2=4.0 * np.eye(3)))
+    with Client(server.address) as client:
+        scene = make_scene(client, count=2)
+        images = [RigImage(PHOTO, CAMERA, pose(i), priors=near) for i in range(2)]
+        assert isinstance(client.localize_rig(images, scene), GroupRejected)
+    assert counts(server) == [4, 4, 4]

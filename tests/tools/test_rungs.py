@@ -8,20 +8,24 @@ from rich.console import Console
 from support.evaluations import evaluation, query_result
 
 from mapless import Attempt
-from mapless_tools.evaluate.metrics import QueryResult
+from mapless_tools.evaluate.metrics import EarlierAnswer, QueryResult
 from mapless_tools.evaluate.report import print_report, to_json
 from mapless_tools.evaluate.rungs import Rung, largest_error, rungs_of, wrong_count
 
 RIGHT, WRONG, LOST = 0.01, 1.0, math.inf
 
 
-def answered(error: float, *attempts: str) -> QueryResult:
-    """An answer off by so many metres, with attempts "rung outcome"; the chosen one begins with a star."""
+def answered(error: float, *attempts: str, earlier: tuple[tuple[str, float], ...] = ()) -> QueryResult:
+    """An answer off by so many metres, with attempts "rung outcome"; the chosen one begins with a star.
+
+    Earlier answers have a rung and an error each.
+    """
     tried = []
     for attempt in attempts:
         rung, outcome = attempt.removeprefix("*").split()
         tried.append(Attempt(rung, "sift", outcome, 0.5, 0.25, chosen=attempt.startswith("*")))
-    return query_result("q", error, 0.1, (30, 40), "planted", attempts=tuple(tried))
+    before = tuple(EarlierAnswer(rung, error, 0.1) for rung, error in earlier)
+    return query_result("q", error, 0.1, (30, 40), "planted", attempts=tuple(tried), earlier=before)
 
 
 @pytest.mark.parametrize(
@@ -44,6 +48,24 @@ def test_a_rung_has_what_its_attempts_gave(
     """On how many it was tried, how many it answered, rescued, and made wrong."""
     rungs = rungs_of([answered(error, *attempts)], largest_error(True, 3.0))
     assert {it.rung: (it.tried, it.answered, it.rescued, it.wrong) for it in rungs} == expected
+
+
+@pytest.mark.parametrize(
+    ("earlier", "rung"),
+    [
+        ((), "wide"),
+        ((("plain", RIGHT),), "wide"),
+        ((("plain", WRONG),), "plain"),
+        ((("plain", WRONG), ("lines", RIGHT)), "wide"),
+        ((("plain", RIGHT), ("lines", WRONG)), "lines"),
+    ],
+)
+def test_the_rung_that_made_an_answer_wrong_counts(earlier: tuple[tuple[str, float], ...], rung: str) -> None:
+    """Not one that only found another wrong pose."""
+    tried = ["plain localized", "lines localized", "*wide localized"]
+    rungs = rungs_of([answered(WRONG, *tried, earlier=earlier)], 0.25)
+    assert [it.rung for it in rungs if it.wrong] == [rung]
+    assert sum(it.wrong for it in rungs) == 1
 
 
 def test_rungs_add_up_over_photographs_in_the_order_tried() -> None:

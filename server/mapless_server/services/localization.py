@@ -137,6 +137,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             give = None  # a thread that has not noticed the end may still have a better one
             call.record(records)
         response, answer = to_message(result), result.answer
+        self._count_attempts([result])
         parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
         call.note(parts_ms=parts_ms, used_references=len(result.references))
         if isinstance(answer.outcome, Localization):
@@ -218,14 +219,13 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     ) -> tuple[GroupResult, Joint]:
         """`localize_group` within the engine's queue, with memory for all of the photographs."""
         engine = self._engine()
+
+        async def posed(asked: Sequence[Query], results: Sequence[Result]) -> Joint:
+            self._count_attempts(results)  # also of a round that is not answered
+            return await engine.join(partial(pose, asked, results), call.caller)
+
         with engine.hold(queries, call.caller):
-            return await localize_group(
-                engine,
-                queries,
-                call,
-                list_name,
-                lambda asked, results: engine.join(partial(pose, asked, results), call.caller),
-            )
+            return await localize_group(engine, queries, call, list_name, posed)
 
     def _finish_group(
         self,
@@ -253,8 +253,6 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         """Reports an answer, a rejection or the message of any localization, to the log and the metrics."""
         for result in results:
             self._metrics.stages(result.stage_seconds)
-            for attempt in result.attempts:
-                self._metrics.attempted(attempt.rung, attempt.outcome)
             if TRACK in result.stage_seconds:
                 self._metrics.tracked(result.is_tracked)
         if isinstance(outcome, Rejection):
@@ -271,6 +269,10 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             scale_deviation=scale.deviation if scale else None,
             accuracy_radius_m=localization.accuracy.position_68_m if is_measured else None,
         )
+
+    def _count_attempts(self, results: Sequence[Result]) -> None:
+        for attempt in (attempt for result in results for attempt in result.attempts):
+            self._metrics.attempted(attempt.rung, attempt.outcome)
 
     def _capture(self, request: Request, response: Response, call: Call, parts: Sequence[tuple[Query, Result]]) -> None:
         if self._recorder is not None and not request.options.confidential:

@@ -15,6 +15,15 @@ RECALL_BARS = {"1cm_1deg": (0.01, 1.0), "5cm_5deg": (0.05, 5.0), "25cm_2deg": (0
 
 
 @dataclass(frozen=True)
+class EarlierAnswer:
+    """An accepted answer that the server had before it made a better one: the attempt's rung, and the errors."""
+
+    rung: str
+    translation_error: float
+    rotation_error_deg: float
+
+
+@dataclass(frozen=True)
 class QueryResult:
     """The result of one query; a rejected one has infinite errors, counts of 0, and no pose.
 
@@ -23,6 +32,7 @@ class QueryResult:
     pose, or for a pose without radii, as is trust. Intrinsics checks are those of the answer, or of the rejection.
     The latency is measured by the client, `stage_ms`, `processor_ms` and those of attempts in the server. The best
     reference has the most inliers. The pose is the answered world_from_camera: x y z and the quaternion x y z w.
+    Earlier answers are those that were accepted before the last, in order.
     """
 
     name: str
@@ -45,6 +55,7 @@ class QueryResult:
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
     processor_ms: float = 0.0
     attempts: tuple[Attempt, ...] = ()
+    earlier: tuple[EarlierAnswer, ...] = ()
 
     @property
     def localized(self) -> bool:

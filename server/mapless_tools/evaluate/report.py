@@ -105,7 +105,8 @@ def print_report(evaluation: Evaluation, console: Console) -> None:
 RUNG_HEAD = ("attempt", "tried", "answered", "rescued", "wrong", "processor s")
 RUNG_NOTES = (
     "Tried: photographs on which the attempt was made; answered: whose answer came from it; of these rescued: those "
-    "localized right although no pose was accepted before; wrong: localized wrongly, whatever was accepted before.",
+    "localized right although no pose was accepted before; wrong: photographs that are localized wrongly since this "
+    "attempt, the answer before which was right, or none.",
 )
 
 
@@ -222,5 +223,6 @@ def _query(result: QueryResult, metric: bool) -> dict[str, Any]:
         "processor_ms": result.processor_ms,
         "stage_ms": dict(result.stage_ms),
         "attempts": [asdict(attempt) for attempt in result.attempts],
+        "earlier": [asdict(answer) for answer in result.earlier],
         "references": list(result.references),
     }

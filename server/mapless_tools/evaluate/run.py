@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from mapless_tools.child import temporary_server
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.progress import Progress, tracked
 
-from .metrics import QueryResult, pose_error, trajectory_radius
+from .metrics import EarlierAnswer, QueryResult, pose_error, trajectory_radius
 from .plan import EvaluationOptions, split_frames
 from .references import Matcher, PlannedQuery, check_images, rank_by_matches
 
@@ -91,7 +91,7 @@ def localize_query(
     image = frame.image_path.read_bytes()
     mask = None if frame.mask_path is None else frame.mask_path.read_bytes()
     start_s = time.perf_counter()
-    answer = client.localize(
+    *earlier, answer = client.localize_progressively(
         image,
         frame.camera,
         scene,
@@ -102,7 +102,13 @@ def localize_query(
         mask=mask,
     )
     latency_ms = 1000 * (time.perf_counter() - start_s)
-    return _result(frame, answer, query.references, latency_ms, references)
+    result = _result(frame, answer, query.references, latency_ms, references)
+    return replace(result, earlier=tuple(_earlier(frame, it) for it in earlier if isinstance(it, LocalizationResult)))
+
+
+def _earlier(frame: Frame, answer: LocalizationResult) -> EarlierAnswer:
+    rung = next((attempt.rung for attempt in answer.diagnostics.attempts if attempt.chosen), "")
+    return EarlierAnswer(rung, *pose_error(frame.world_from_camera, answer.world_from_camera))
 
 
 def _result(

@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from .metrics import QueryResult
+from .metrics import EarlierAnswer, QueryResult
 
 RIGHT_M, RIGHT_SHARE, RIGHT_DEG = 0.25, 0.05, 5.0
 """An answer is right that is off by at most so many metres and degrees; where the unit of length is arbitrary, by such
@@ -22,7 +22,7 @@ class Rung:
         tried: photographs on which it was made, once or more often.
         answered: photographs whose answer came from it, rejections included.
         rescued: of these the ones that are localized right although no earlier attempt's pose was accepted.
-        wrong: of these the ones that are localized wrongly.
+        wrong: photographs that are localized wrongly since this attempt: the answer before it was right, or none.
         processor_s: processor time of all its attempts, seconds.
     """
 
@@ -39,9 +39,9 @@ def largest_error(is_metric: bool, trajectory_radius: float) -> float:
     return RIGHT_M if is_metric else RIGHT_SHARE * trajectory_radius
 
 
-def is_right(result: QueryResult, largest: float) -> bool:
-    """Whether a query is localized, off by at most so much, in the dataset's unit, and `RIGHT_DEG`."""
-    return result.localized and result.translation_error <= largest and result.rotation_error_deg <= RIGHT_DEG
+def is_right(result: QueryResult | EarlierAnswer, largest: float) -> bool:
+    """Whether an answer is a pose, off by at most so much, in the dataset's unit, and `RIGHT_DEG`."""
+    return result.translation_error <= largest and result.rotation_error_deg <= RIGHT_DEG
 
 
 def wrong_count(results: Sequence[QueryResult], largest: float) -> int:
@@ -63,9 +63,21 @@ def _rung(name: str, results: Sequence[QueryResult], largest: float) -> Rung:
         tried=len(tried),
         answered=len(answered),
         rescued=sum(is_right(it, largest) and not _is_accepted_before(it) for it in answered),
-        wrong=wrong_count(answered, largest),
+        wrong=sum(_made_wrong_by(it, largest) == name for it in results),
         processor_s=sum(attempt.processor_s for it in tried for attempt in it.attempts if attempt.rung == name),
     )
+
+
+def _made_wrong_by(result: QueryResult, largest: float) -> str | None:
+    """The rung since which a query is localized wrongly; None if it is not, or if nothing lists its attempts."""
+    rung = next((attempt.rung for attempt in result.attempts if attempt.chosen), None)
+    if not result.localized or is_right(result, largest):
+        return None
+    for answer in reversed(result.earlier):
+        if is_right(answer, largest):
+            break
+        rung = answer.rung
+    return rung
 
 
 def _is_accepted_before(result: QueryResult) -> bool:

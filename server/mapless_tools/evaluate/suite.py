@@ -27,7 +27,7 @@ from mapless_tools.progress import Progress, labelled
 from mapless_tools.usage import UsageError
 
 from .benchmarks import ScenePlace
-from .metrics import QueryResult
+from .metrics import EarlierAnswer, QueryResult
 from .plan import EvaluationOptions, Method, SceneSplit, SuiteOptions, setting_name
 from .references import Matcher, Pairs, PlannedQuery, paired, rank_by_matches
 from .run import localize_query, store_references
@@ -236,6 +236,7 @@ def _result(line: dict[str, Any]) -> QueryResult:
     line["accuracy"] = None if line["accuracy"] is None else Accuracy(**line["accuracy"])
     line["intrinsics_checks"] = tuple(IntrinsicsCheck(**check) for check in line["intrinsics_checks"])
     line["attempts"] = tuple(Attempt(**attempt) for attempt in line["attempts"])
+    line["earlier"] = tuple(EarlierAnswer(**answer) for answer in line["earlier"])
     return QueryResult(**line)
 
 
