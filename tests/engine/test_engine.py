@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from support.images import encode, textured
 from support.planted_engine import (
-    DOUBT,
     DOUBTFUL_INLIERS,
     FEATURES,
     NEAR_ORIGIN,
@@ -28,19 +27,19 @@ from support.planted_engine import (
     query_of,
     rejected,
 )
-from support.servers import CAMERA, PHOTO, StandInExtractor, pose, whole
+from support.servers import CAMERA, PHOTO, StandInExtractor, pose
 
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Photo, Result, Tier
 from mapless_server.engine.search import SearchJob
-from mapless_server.engine.stages import MAX_LISTINGS, QueryStages
+from mapless_server.engine.stages import MAX_LISTINGS
 from mapless_server.errors import InvalidArgument, Unavailable
 from mapless_server.method.features.views import PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.judge import LEVELS, JudgeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing, Sphere
-from mapless_server.scheduling import CostModel, Done
+from mapless_server.scheduling import CostModel
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, SelfCalibration, calibrations
 
@@ -188,19 +187,6 @@ class TestTiers:
         assert hint_of(setting.localize()).message == (
             f"{advice} Trying it with stronger features was not finished: asking again, when less is asked, may help."
         )
-
-    def test_a_search_that_is_given_up_leaves_the_first_answer(self, setting: Setting) -> None:
-        tried = whole(lambda *_: rejected())
-        stages = QueryStages(setting.engine.tiers, DOUBT, tried, lambda search: search.attempt.features == 1)
-        job = setting.engine.query_job(query_of(("r0", "r1")), caller())
-        while True:
-            (result,) = getattr(stages, job.step.stage)([job])
-            if isinstance(result, Done):
-                break
-            job.step = result.steps[0]
-        assert result.value.tier.extractor.name == "cheap"
-        assert "stronger features was not finished" in hint_of(result.value).message
-        assert result.value.attempts[-1].outcome == "unfinished"
 
     def test_a_better_answer_never_waits_for_feature_extraction(self, setting: Setting) -> None:
         """It is done after the call, once, and the next doubtful query has the better answer."""

@@ -39,12 +39,13 @@ from mapless import (
 from mapless.geometry import RigidTransform as Pose
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.method.judge.hypothesis import Attempt
+from mapless_server.scheduling import Next, Step
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call, encode_call
 from mapless_server.services.capture.files import blob_path, calls_of
 from mapless_server.settings import load_settings
 from mapless_tools.child import child_server
 from mapless_tools.replay import report as report_module
-from mapless_tools.replay.recompute import given_up, recompute
+from mapless_tools.replay.recompute import followed, recompute
 from mapless_tools.replay.report import Report, Selection, select
 
 pytestmark = pytest.mark.nightly("replay")
@@ -311,16 +312,29 @@ def test_a_replay_that_is_not_possible_is_refused(captured: Path, arguments: lis
     assert "Traceback" not in done.stderr
 
 
+CAPTURED = [("as it is", "cheap", "gate"), ("lines", "cheap", "gate"), ("stronger", "strong", "unfinished")]
+
+
 @pytest.mark.parametrize(
-    ("rung", "features", "is_given_up"),
-    [("stronger", 1, True), ("stronger", 0, False), ("wide", 1, False), ("lines", 1, False)],
+    ("steps", "count", "expected"),
+    [
+        (["as it is", "stronger"], 0, ("as it is", True)),
+        (["wide", "lines", "stronger"], 1, ("lines", True)),
+        (["wide", "stronger"], 2, ("stronger", False)),
+        (["wide", "lines"], 2, ("wide", True)),
+        (["wide", "lines"], 3, ("wide", True)),
+    ],
+    ids=["first", "second", "without a result", "not among them", "after the last"],
 )
-def test_attempts_that_had_no_time_are_given_up_again(rung: str, features: int, is_given_up: bool) -> None:
-    ended = [("wide", "strong", "gate"), ("stronger", "strong", "unfinished")]
-    then = pb.Diagnostics(attempts=[pb.Attempt(rung=r, features=f, outcome=o) for r, f, o in ended])
+def test_attempts_are_those_of_the_captured_answer(steps: list[str], count: int, expected: tuple[str, bool]) -> None:
+    """In its order; and one that had no result then has none again, as if there were no time."""
+    then = [pb.Attempt(rung=r, features=f, outcome=o) for r, f, o in CAPTURED]
     tiers: Any = [SimpleNamespace(features=it) for it in ("cheap", "strong")]
-    search: Any = SimpleNamespace(rung=rung, attempt=Attempt(features))
-    assert given_up(then, tiers)(search) == is_given_up
+    payloads: Any = [
+        SimpleNamespace(rung=it, attempt=Attempt(int(it == "stronger")), attempts=(None,) * count) for it in steps
+    ]
+    step, had_result = followed(then, tiers, Next(tuple(Step("", "", "", it) for it in payloads)))
+    assert (step.payload.rung, had_result) == expected
 
 
 def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -81,19 +81,16 @@ class QueryStages:
         tiers: Sequence[Tier],
         doubt: DoubtOptions,
         method: Method | None = None,
-        gives_up: Callable[[Search], bool] = lambda search: False,
         is_alone: Callable[[], bool] = lambda: False,
     ) -> None:
         """Uses the features of these tiers, the cheapest first; see `EngineOptions` for the options.
 
-        A further attempt that `gives_up` is not begun, as if there were no time: where a captured call is replayed. A
-        query that `is_alone` may use all threads where otherwise others would wait for one.
+        A query that `is_alone` may use all threads where otherwise others would wait for one.
         """
         self._tiers = tiers
         self._doubt = doubt
         self._verdicts = Verdicts(tiers, doubt)
         self._method = method or Method()
-        self._gives_up = gives_up
         self._is_alone = is_alone
 
     def prepare(self, jobs: Sequence[SearchJob]) -> list[SearchResult]:
@@ -366,10 +363,7 @@ class QueryStages:
         give_up_s = now_s + TIME_SHARE * (search.deadline_s - now_s)
         situation, doubts = search.situation(self._tiers), search.verdict.doubts
         for rung, attempt in ladder.further(before, search.best, search.tried, doubts, situation):
-            further = search.to(rung.name, attempt, give_up_s, features)
-            if self._gives_up(further):
-                return self._unfinished(further, "unfinished")
-            steps.append(further.first_step)
+            steps.append(search.to(rung.name, attempt, give_up_s, features).first_step)
         return self._next(steps[0].payload, *steps) if steps else self._done(search)
 
     def _skipped(self, search: Search, outcome: str = SKIPPED) -> SearchResult:

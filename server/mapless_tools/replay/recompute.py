@@ -34,7 +34,7 @@ from mapless_server.engine.query import (
     Tier,
 )
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.engine.search import Search, SearchJob
+from mapless_server.engine.search import Search, SearchJob, SearchStep
 from mapless_server.engine.stages import Method, QueryStages
 from mapless_server.errors import DataLoss
 from mapless_server.images import decode_image, decode_mask
@@ -48,7 +48,7 @@ from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Selection
 from mapless_server.scenes.library import STORED_IMAGES, Loaded
-from mapless_server.scheduling import Done, Flow, Job
+from mapless_server.scheduling import Done, Flow, Job, Next
 from mapless_server.security import Principal, SceneKey, scene_id_of
 from mapless_server.services.capture.calls import (
     CapturedCall,
@@ -254,9 +254,9 @@ class _Recomputing:
 
     async def run(self, job: SearchJob) -> Result:
         search = job.step.payload
-        gives_up = given_up(self._then[search.query.photo.field], self._tiers)
-        stages = QueryStages(self._tiers, self.options.doubt, self._method, gives_up)
-        return await asyncio.to_thread(_compute, stages, job)
+        attempts = self._then[search.query.photo.field].attempts
+        stages = QueryStages(self._tiers, self.options.doubt, self._method)
+        return await asyncio.to_thread(_compute, stages, job, partial(followed, attempts, self._tiers))
 
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
@@ -272,7 +272,9 @@ def _unrefined(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
     return solve(coarse, attempt, doubt) if answer is None else found_by(attempt, answer, doubt)
 
 
-def _compute(stages: QueryStages, job: SearchJob) -> Result:
+def _compute(
+    stages: QueryStages, job: SearchJob, follow: Callable[[Next[Search, Result]], tuple[SearchStep, bool]]
+) -> Result:
     of_name = {PREPARE: stages.prepare, COARSE: stages.coarse, REFINE: stages.refine}
     while True:
         (result,) = of_name[job.step.stage]([job])
@@ -280,14 +282,25 @@ def _compute(stages: QueryStages, job: SearchJob) -> Result:
             return result.value
         if isinstance(result, Exception):
             raise result
-        job.step = result.steps[0]
+        job.step, had_result = follow(result)
+        if not had_result and result.fallback is not None:
+            return result.fallback.make(job.step.payload).value
 
 
-def given_up(then: pb.Diagnostics, tiers: Sequence[Tier]) -> Callable[[Search], bool]:
-    """Says of a further attempt whether it had no result in an answer with these diagnostics."""
-    ended = ("unfinished", "failed", "out_of_memory")
-    unfinished = {(it.rung, it.features) for it in then.attempts if it.outcome in ended}
-    return lambda search: (search.rung, tiers[search.attempt.features].features) in unfinished
+def followed(
+    then: Sequence[pb.Attempt], tiers: Sequence[Tier], following: Next[Search, Result]
+) -> tuple[SearchStep, bool]:
+    """The step of the attempt that came next in a captured answer, and whether that had a result.
+
+    The first step where the captured answer had no further attempt, as those of servers that did not list them.
+    """
+    count = len(following.steps[0].payload.attempts)
+    for captured in then[count : count + 1]:
+        for step in following.steps:
+            search = step.payload
+            if (search.rung, tiers[search.attempt.features].features) == (captured.rung, captured.features):
+                return step, captured.outcome not in ("unfinished", "failed", "out_of_memory")
+    return following.steps[0], True
 
 
 def _is_cut_short(request: Any, then: Response) -> bool:
