@@ -312,7 +312,7 @@ def test_a_replay_that_is_not_possible_is_refused(captured: Path, arguments: lis
     assert "Traceback" not in done.stderr
 
 
-CAPTURED = [("as it is", "cheap", "gate"), ("lines", "cheap", "gate"), ("stronger", "strong", "unfinished")]
+THEN = [("as it is", "cheap", "gate"), ("lines", "cheap", "gate"), ("stronger", "strong", "unfinished")]
 
 
 @pytest.mark.parametrize(
@@ -328,7 +328,7 @@ CAPTURED = [("as it is", "cheap", "gate"), ("lines", "cheap", "gate"), ("stronge
 )
 def test_attempts_are_those_of_the_captured_answer(steps: list[str], count: int, expected: tuple[str, bool]) -> None:
     """In its order; and one that had no result then has none again, as if there were no time."""
-    then = [pb.Attempt(rung=r, features=f, outcome=o) for r, f, o in CAPTURED]
+    then = [pb.Attempt(rung=r, features=f, outcome=o) for r, f, o in THEN]
     tiers: Any = [SimpleNamespace(features=it) for it in ("cheap", "strong")]
     payloads: Any = [
         SimpleNamespace(rung=it, attempt=Attempt(int(it == "stronger")), attempts=(None,) * count) for it in steps

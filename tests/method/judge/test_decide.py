@@ -139,7 +139,8 @@ class TestOnePlace:
         """The answers claim 0.5 m, the jackknife 1 cm."""
         first, second = (hypothesis(posed(accepted(x_m, sigma_m=0.5), x_m)) for x_m in (0.0, 1.0))
         assert not at_one_place(first, second)
-        assert at_one_place(*(hypothesis(accepted(x_m, sigma_m=0.5)) for x_m in (0.0, 1.0)))
+        first, second = (hypothesis(accepted(x_m, sigma_m=0.5)) for x_m in (0.0, 1.0))
+        assert at_one_place(first, second)
 
     @pytest.mark.parametrize(("turn_deg", "is_same"), [(1.9, True), (3.0, False)])
     def test_poses_that_look_elsewhere_are_two_places(self, turn_deg: float, is_same: bool) -> None:

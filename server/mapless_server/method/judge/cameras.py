@@ -41,11 +41,8 @@ def intrinsics_checks(evidence: IntrinsicsEvidence, options: ContradictionOption
     change[0] = sent.focal_x_px * np.expm1(evidence.value[0])
     estimated, sigma, given_sigma = given + change, unit * evidence.sigma, unit * evidence.prior_sigma
     conflict, used = evidence.contradicted(options, evidence.prior_sigma), evidence.removed != 0
-    columns = zip(given, estimated, sigma, given_sigma, strict=True)
-    return tuple(
-        IntrinsicsCheck(parameter, *map(float, values), conflict=bool(conflict[i]), used=bool(used[i]))
-        for i, (parameter, values) in enumerate(zip(IntrinsicsParameter, columns, strict=True))
-    )
+    columns = *(it.tolist() for it in (given, estimated, sigma, given_sigma)), conflict.tolist(), used.tolist()
+    return tuple(map(IntrinsicsCheck, IntrinsicsParameter, *columns))
 
 
 def _parameters(camera: Camera) -> Array:
