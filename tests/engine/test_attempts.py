@@ -68,6 +68,21 @@ def test_after_a_search_elsewhere_stronger_features_are_tried(setting: Setting, 
     assert by_rung["stronger"] == "too_few_matches"
 
 
+def test_after_a_skipped_rung_those_of_the_basis_before_are_tried(
+    setting: Setting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the queue had no time for them before, or their order is another."""
+    elsewhere = next(it for it in ladder.RUNGS if it.name == "elsewhere")
+    monkeypatch.setattr(ladder, "RUNGS", (elsewhere, *(it for it in ladder.RUNGS if it is not elsewhere)))
+    setting.replies = dict.fromkeys(("cheap", "strong"), rejected())
+    priors = Priors(position=PositionPrior(pose(0.0).translation, 16 * np.eye(3)))
+    narrowing = replace(Narrowing.of(priors), margin_m=0.01)
+    result = setting.localize(reference_ids=(), reference_count=3, priors=priors, narrowing=narrowing)
+    assert [(it.rung, it.outcome) for it in result.attempts][:3] == [
+        ("as it is", "too_few_matches"), ("elsewhere", "skipped"), ("wide", "low_overlap")
+    ]  # fmt: skip
+
+
 def test_a_rung_without_memory_leaves_the_best_answer(setting: Setting) -> None:
     def full(*_: object) -> Answer:
         raise MemoryError

@@ -118,7 +118,7 @@ class Search:
             between stages.
         material: the photograph and references; None until they are chosen.
         prepared: the photographs' matches, for the stage `coarse`.
-        coarse: the reconstruction that attempts of one basis begin with.
+        coarse: the reconstruction that attempts of the material's basis begin with.
     """
 
     query: Query
@@ -199,7 +199,6 @@ class Search:
             listings=1,
             context=StageContext(self.context.check) if is_other else self.context,
             spent_s=self.seconds(features) if is_other else self.spent_s,
-            coarse=None if is_other else self.coarse,
         )
 
     def seconds(self, features: str) -> dict[str, float]:

@@ -181,7 +181,7 @@ class QueryStages:
         material = self._material(search)
         if material is None:
             return self._skipped(search)
-        search = replace(search, material=material)
+        search = replace(search, material=material, coarse=None)
         if not material.references:
             rejection = Rejection(RejectionReason.NO_USABLE_REFERENCES, material.missing)
             return self._conclude(search, found_by(search.attempt, Answer(rejection), self._doubt, Doubt.REFERENCES))
