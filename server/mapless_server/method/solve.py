@@ -104,7 +104,7 @@ def _judged(support: PosedSupport, coarse: Coarse, chance: float, agreement: flo
     if judged.rejection:
         return coarse.answer(judged.rejection, support)
     estimate = with_halves(support.estimate, judged.evidence.disagreement * support.distance_m())
-    checks = intrinsics_checks(estimate.intrinsics, options.intrinsics) if estimate.intrinsics else ()
+    checks = intrinsics_checks(estimate.intrinsics) if estimate.intrinsics else ()
     return coarse.answer(Localization.of(estimate, judged.trust, None, checks), support)
 
 
@@ -134,14 +134,13 @@ def _from_lines(coarse: Coarse) -> Answer:
 
     A pose that its evidence does not accept is no hypothesis: its matches agree with many others, too.
     """
-    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
-    support = _two_view_support(coarse)
+    prepared, support = coarse.prepared, _two_view_support(coarse)
     if support is None:
         return coarse.answer(Rejection(RejectionReason.TOO_FEW_MATCHES, "no pose fits the epipolar lines of matches"))
     with prepared.context.stage("judge"):
         evidence = two_view_evidence(without_unmoved(support, prepared.pipeline.matcher.pairs.stationary))
         doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
-        rejection = None if doubt else contradiction(support, votes_of(support), options.judge, unit=prepared.unit)
+        rejection = None if doubt else contradiction(support, votes_of(support), prepared.unit)
     if rejection:
         return coarse.answer(rejection, support)
     if doubt and lacks_distance(evidence):

@@ -15,7 +15,6 @@ from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_server.method.bundle.adjust import adjust_pose
 from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
 from mapless_server.method.bundle.intrinsics import (
-    ContradictionOptions,
     IntrinsicsEvidence,
     corrected,
     keypoint_motion,
@@ -98,7 +97,7 @@ def test_a_lens_without_a_radial_coefficient_is_held() -> None:
     assert abs(evidence.value[0] - 0.03) < 3 * evidence.sigma[0] < 0.01
     assert (evidence.value[3], evidence.removed[3]) == (0.0, 0.0)
     assert evidence.sigma[3] == pytest.approx(evidence.prior_sigma[3])
-    judged = wrong_intrinsics(evidence, "best", ContradictionOptions())
+    judged = wrong_intrinsics(evidence, "best")
     assert judged
     assert [it.parameter for it in judged.intrinsics_checks if it.conflict] == [FOCAL]
 
@@ -159,7 +158,7 @@ def test_a_photograph_that_errs_otherwise_shares_no_camera(error: float, is_shar
     scene = replace(scene, query=replace(query, features=replace(query.features, keypoints=keypoints)))
     found, stated = adjusted(scene), adjusted(scene, IntrinsicsSigma())
     assert found.intrinsics
-    assert wrong_intrinsics(found.intrinsics, "best", ContradictionOptions()) is None
+    assert wrong_intrinsics(found.intrinsics, "best") is None
     sigma_m, stated_m = (np.sqrt(np.trace(it.covariance[:3, :3])) for it in (found, stated))
     assert (sigma_m < 0.7 * stated_m) == is_shared, (sigma_m, stated_m, found.intrinsics.value, found.intrinsics.sigma)
     off_m = np.linalg.norm(found.world_from_camera.translation - scene.world_from_query.translation)
@@ -186,7 +185,7 @@ def test_a_contradicted_parameter_is_estimated_with_the_pose(case: str) -> None:
     assert (np.abs(found.intrinsics.value - errors) < 3 * sigma)[wrong].all()
     assert (np.abs(found.intrinsics.removed - errors) < 1.5 * found.intrinsics.prior_sigma).all()
     assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.012, degrees=0.2)
-    judged = wrong_intrinsics(found.intrinsics, "best", ContradictionOptions())
+    judged = wrong_intrinsics(found.intrinsics, "best")
     assert judged
     assert [it.conflict for it in judged.intrinsics_checks] == wrong.tolist()
 
@@ -199,7 +198,7 @@ def test_a_wide_prior_leaves_the_intrinsics_to_the_photograph(case: str) -> None
     assert found.intrinsics
     assert (found.intrinsics.removed != 0).any()
     assert_pose_close(found.world_from_camera, scene.world_from_query, metres=0.012, degrees=0.2)
-    assert wrong_intrinsics(found.intrinsics, "best", ContradictionOptions()) is None
+    assert wrong_intrinsics(found.intrinsics, "best") is None
 
 
 def test_a_prior_as_wide_as_that_of_estimates_ends() -> None:
@@ -217,7 +216,7 @@ def test_right_intrinsics_are_never_rejected() -> None:
         found = adjusted(scene)
         assert found.intrinsics
         assert found.view is None
-        assert wrong_intrinsics(found.intrinsics, "best", ContradictionOptions()) is None
+        assert wrong_intrinsics(found.intrinsics, "best") is None
 
 
 def test_a_flat_wall_contradicts_no_focal_length() -> None:
@@ -226,7 +225,7 @@ def test_a_flat_wall_contradicts_no_focal_length() -> None:
     found = adjusted(misread(make_scene(random_for("wall"), frontal), (0.05, 0, 0, 0)))
     assert found.view is None
     assert found.intrinsics
-    assert wrong_intrinsics(found.intrinsics, "best", ContradictionOptions()) is None
+    assert wrong_intrinsics(found.intrinsics, "best") is None
 
 
 def evidence_of(lens: Distortion | None, value: tuple[float, ...]) -> IntrinsicsEvidence:
@@ -252,7 +251,7 @@ def evidence_of(lens: Distortion | None, value: tuple[float, ...]) -> Intrinsics
 def test_a_rejection_names_the_parameter_and_its_value(
     lens: Distortion | None, value: tuple[float, ...], message: str, advice: str
 ) -> None:
-    rejection = wrong_intrinsics(evidence_of(lens, value), "scenes/hall/references/a", ContradictionOptions())
+    rejection = wrong_intrinsics(evidence_of(lens, value), "scenes/hall/references/a")
     assert rejection
     assert rejection.reason is RejectionReason.GATE
     assert re.search(message.replace("+-", r"\+-"), rejection.message), rejection.message
@@ -263,14 +262,14 @@ def test_a_rejection_names_the_parameter_and_its_value(
 
 def test_what_the_prior_allows_is_no_conflict() -> None:
     """One percent of the focal length is significant, but three of both standard deviations together."""
-    (focal, *_) = intrinsics_checks(evidence_of(None, (0.0105, 0, 0, 0)), ContradictionOptions())
+    (focal, *_) = intrinsics_checks(evidence_of(None, (0.0105, 0, 0, 0)))
     assert not focal.conflict
     assert focal.used
     assert focal.estimated == pytest.approx(1050 * np.exp(0.0105))
     wider = replace(evidence_of(None, (0.03, 0, 0, 0)), prior_sigma=np.array([0.02, 2, 2, 0.01]))
-    assert wrong_intrinsics(wider, "best", ContradictionOptions()) is None
+    assert wrong_intrinsics(wider, "best") is None
     unsure = replace(evidence_of(None, (0.3, 0, 0, 0)), sigma=np.array([0.05, 1, 1, 0.01]))
-    assert wrong_intrinsics(unsure, "best", ContradictionOptions()) is None
+    assert wrong_intrinsics(unsure, "best") is None
 
 
 def test_reduced_equations_equal_those_of_plain_rows() -> None:

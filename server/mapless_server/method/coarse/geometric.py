@@ -104,9 +104,8 @@ class GeometricReconstructor:
     ) -> tuple[Rejection | None, NDArray[np.bool_]]:
         """Returns the reason to reject the pose, if any, and which of the matches (M,) are its inliers."""
         inliers, named = np.zeros(len(matches), bool), "matches with the references' points"
-        failure: str | None = (
-            f"the photograph matches {len(matches)} of {len(structure.x_in_world)} points of the references"
-        )
+        count = f"{len(matches)} of {len(structure.x_in_world)} points"
+        failure: str | None = f"the photograph matches {count} of the references"
         if pose is not None:
             inliers = matches.seen(query, structure.x_in_world).errors_px(pose) < PNP.inlier_px
             chance = priors.log10_chance(pose)

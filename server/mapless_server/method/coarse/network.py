@@ -44,9 +44,8 @@ class NetworkOptions:
     Attributes:
         pixel_limit: largest number of pixels of a picture.
         cache: of references' tokens.
-        query_rays: whether a network that takes intrinsics gets the query's. MapAnything saw hardly any view with
-            intrinsics and without a pose among posed ones when it was trained, and few views with neither: which is
-            better has to be measured with its weights.
+        query_rays: whether a network that takes intrinsics gets the query's. MapAnything saw few views without a pose
+            among posed ones when it was trained, with intrinsics or without: not measured.
     """
 
     pixel_limit: int = PIXEL_LIMIT
@@ -218,10 +217,7 @@ class NetworkReconstructor:
 
 @dataclass(frozen=True, eq=False)
 class _LaidOut:
-    """A view's photograph and its layout on the scene's grid.
-
-    `given_rays` is whether the view's intrinsics are given to a network that takes intrinsics.
-    """
+    """A view's photograph, its layout on the scene's grid, and whether a network may be given its intrinsics."""
 
     photograph: Photograph
     layout: Layout

@@ -3,20 +3,8 @@
 The paper's scale estimation and pose initialization. Stage 1 compares depths triangulated from the known poses with the
 predicted depths; if the predicted trajectory, scaled by the result, is as large as the known one, this scale is
 adopted. Otherwise stage 2 aligns the predicted trajectory with the known one, and the stage whose scale fits the
-trajectory's size better is used.
-
-=====================  ======================================================
-in the paper           here
-=====================  ======================================================
-S                      `metres_per_unit`
-[R^GT | t^GT]          world_from_camera of the references
-[R^local | t^local]    local_from_camera of the reconstruction's views
-C^GT, C^local          translations of these
-r; d                   `trajectory_radius`; `trajectory_deviation`
-S_tri                  the median of `triangulated_ratios`
-S_traj                 `trajectory_scale`
-R_align; P_q^init      in `estimate_scale`
-=====================  ======================================================
+trajectory's size better is used. In the paper, S is `metres_per_unit`, S_tri the median of `triangulated_ratios`; known
+poses are marked GT, those of the reconstruction local.
 """
 
 import math
@@ -165,9 +153,8 @@ def known_scale(
 ) -> MetricScale | Rejection:
     """The scale of a reconstruction that was triangulated from the known poses, so that it is metric already.
 
-    The structure has at least one point, and its tracks the references' order; any strategy finds this scale, of the
-    frame `unit_frame`. NO_USABLE_REFERENCES for fewer than two references, DEGENERATE_REFERENCES for references too
-    close to one another.
+    The structure has at least one point, and its tracks the references' order; the frame is `unit_frame`.
+    NO_USABLE_REFERENCES for fewer than two references, DEGENERATE_REFERENCES for references too close to one another.
     """
     rejection = _check_references(references)
     if rejection:

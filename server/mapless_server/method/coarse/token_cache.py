@@ -1,7 +1,6 @@
 """Cache of references' tokens, which a network computes from one view alone, so they are the same in every call.
 
-Tokens are kept on the device, and in the host's memory if the device has no room. The key holds everything that they
-depend on, so an entry is never stale.
+Tokens are kept on the device, and in the host's memory if the device has no room.
 """
 
 import threading

@@ -1,7 +1,4 @@
-"""How two photographs are matched: options of each kind of features, nearest neighbours, and what a network offers.
-
-Nearest neighbours are those of the descriptors.
-"""
+"""How two photographs are matched: options of each kind of features, nearest descriptors, and what a network offers."""
 
 import time
 from collections import deque

@@ -67,10 +67,6 @@ class Tracks:
         count, ends = len(self.point), np.append(self.starts, len(self.point))
         return csr_array((np.ones(count), np.arange(count), ends), shape=(self.point_count, count))
 
-    def max_by_point(self, values: Array) -> Array:
-        """Largest of values (O,) over each point's observations, (P,)."""
-        return np.maximum.reduceat(values, self.starts) if len(self.starts) else values[:0]
-
     def prune(self, observations: NDArray[np.bool_]) -> tuple[Tracks, NDArray[np.bool_], NDArray[np.bool_]]:
         """Keeps the chosen observations (O,), without points that have fewer than two of them.
 

@@ -32,7 +32,7 @@ from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 
 
-def intrinsics_checks(evidence: IntrinsicsEvidence, options: ContradictionOptions) -> tuple[IntrinsicsCheck, ...]:
+def intrinsics_checks(evidence: IntrinsicsEvidence) -> tuple[IntrinsicsCheck, ...]:
     """The checks of all parameters, in pixels of the photograph as it was sent."""
     sent, scale = evidence.sent, evidence.sent.width_px / evidence.given.width_px
     given = _parameters(sent)
@@ -40,9 +40,12 @@ def intrinsics_checks(evidence: IntrinsicsEvidence, options: ContradictionOption
     change = unit * evidence.value
     change[0] = sent.focal_x_px * np.expm1(evidence.value[0])
     estimated, sigma, given_sigma = given + change, unit * evidence.sigma, unit * evidence.prior_sigma
-    conflict, used = evidence.contradicted(options, evidence.prior_sigma), evidence.removed != 0
-    columns = *(it.tolist() for it in (given, estimated, sigma, given_sigma)), conflict.tolist(), used.tolist()
-    return tuple(map(IntrinsicsCheck, IntrinsicsParameter, *columns))
+    conflict, used = evidence.contradicted(ContradictionOptions(), evidence.prior_sigma), evidence.removed != 0
+    columns = zip(given, estimated, sigma, given_sigma, strict=True)
+    return tuple(
+        IntrinsicsCheck(parameter, *map(float, values), conflict=bool(conflict[i]), used=bool(used[i]))
+        for i, (parameter, values) in enumerate(zip(IntrinsicsParameter, columns, strict=True))
+    )
 
 
 def _parameters(camera: Camera) -> Array:
@@ -51,11 +54,9 @@ def _parameters(camera: Camera) -> Array:
     return np.array([camera.focal_x_px, camera.principal_x_px, camera.principal_y_px, k1])
 
 
-def wrong_intrinsics(
-    evidence: IntrinsicsEvidence, best_reference: str, options: ContradictionOptions
-) -> Rejection | None:
+def wrong_intrinsics(evidence: IntrinsicsEvidence, best_reference: str) -> Rejection | None:
     """A rejection that names each parameter in conflict, the most significant first; None if there is none."""
-    checks = intrinsics_checks(evidence, options)
+    checks = intrinsics_checks(evidence)
     wrong = sorted(
         (it for it in checks if it.conflict), key=lambda it: -abs(it.estimated - it.given) / it.estimated_sigma
     )

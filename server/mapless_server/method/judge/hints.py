@@ -1,7 +1,4 @@
-"""Hints: what would help after a rejection.
-
-A hint follows from the numbers of the answer: features of the photograph, matches with each reference, inliers.
-"""
+"""Hints: what would help after a rejection, by its numbers of features, of matches with each reference, of inliers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,10 +18,8 @@ _STAGES = {
     RejectionReason.SCALE_UNRELIABLE: "scale",
     RejectionReason.TOO_FEW_MATCHES: "match",
     RejectionReason.PNP_FAILED: "pnp",
-    RejectionReason.GATE: "judge",
-    RejectionReason.AMBIGUOUS: "judge",
-    RejectionReason.PRIOR_CONFLICT: "judge",
 }
+"""The stages that reject for these reasons; for the others it is the judge."""
 
 FEW_FEATURES = 200
 """A photograph with fewer is dark, blurred or shows nothing; sharp ones have 500 to 2048."""
@@ -59,10 +54,7 @@ class _Case:
 
 
 def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_prior: bool = False) -> Answer:
-    """Adds a hint to a rejection without one; the references are in the order of the answer's counts.
-
-    `has_prior` is whether the request has a prior on position or heading.
-    """
+    """Adds a hint to a rejection without one; `has_prior` is whether the request has one on position or heading."""
     rejection = answer.outcome
     if not isinstance(rejection, Rejection) or rejection.hint is not None:
         return answer
@@ -84,7 +76,7 @@ def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_pri
     share = query.photograph.ignored_share if query.photograph else 0.0
     if share >= MUCH_IGNORED or (share > 0 and case.features < FEW_FEATURES):
         message += f" The mask ignores {_percent(share)} of the image: 0 means ignore, every other value use."
-    hint = Hint(_STAGES[rejection.reason] if references else "", advice, message, case.best)
+    hint = Hint(_STAGES.get(rejection.reason, "judge") if references else "", advice, message, case.best)
     return replace(answer, outcome=replace(rejection, hint=hint))
 
 

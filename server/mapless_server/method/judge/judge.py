@@ -26,7 +26,7 @@ removes the matches of the weaker place.
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,17 +34,9 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
 
 from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance
-from ..bundle.intrinsics import ContradictionOptions
 from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.one_reference import Found
-from ..pose.pnp import (
-    MAX_LOG10_FALSE_ALARMS,
-    PnpOptions,
-    disc_chance,
-    false_alarms,
-    format_false_alarms,
-    ransac,
-)
+from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .cameras import wrong_camera, wrong_intrinsics
 from .evidence import Evidence, Votes, evidence_of, votes_of
@@ -81,7 +73,6 @@ _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the right answers at which `JudgeOptions.scores` are the quantiles."""
 
-
 ONE_REFERENCE_SCORES = (
     39.6, 39.6, 39.6, 39.8, 40.9, 58.2, 66.6, 127.2, 165.8, 185.0,
     272.3, 487.4, 628.0, 838.7, 945.9, 1291.4, 1647.3, 2464.5, 3837.8, 4685.0,
@@ -93,18 +84,12 @@ of 5 % of each."""
 
 @dataclass(frozen=True)
 class JudgeOptions:
-    """Options of the judge.
-
-    Attributes:
-        scores: quantiles of the scores of right answers at `LEVELS`.
-        intrinsics: options of the check of the photograph's intrinsics.
-    """
+    """Options of the judge: `scores`, quantiles of the scores of right answers at `LEVELS`."""
 
     scores: tuple[float, ...] = (
         -12.224, -11.752, -11.254, -10.17, -8.789, -7.801, -6.527, -4.942, -3.329, -1.931,
         -0.623, 0.323, 1.854, 2.719, 3.518, 4.185, 4.882, 5.504, 6.015, 6.717,
     )  # fmt: skip
-    intrinsics: ContradictionOptions = field(default_factory=ContradictionOptions)
 
     def __post_init__(self) -> None:
         if len(self.scores) != len(LEVELS):
@@ -135,35 +120,22 @@ class Judgement:
 def judge(
     support: PosedSupport, coverage: float, options: JudgeOptions, log10_chance: float = 0.0, unit: str = "m"
 ) -> Judgement:
-    """Judges the estimate of a support, which has passed the gate.
+    """Judges the estimate of a support, which has passed the gate; `coverage` is the share of right answers to accept.
 
-    Args:
-        support: the support.
-        coverage: share of right answers to accept, above 0 and at most 1.
-        options: options of the judge.
-        log10_chance: see `Priors.log10_chance`.
-        unit: the scene's unit of length, in messages.
-
-    Returns:
-        The judgement. Its rejection, in the support's world, is GATE, with a hint, if the references disagree, the
-        photograph contradicts its intrinsics or the position's radius is too large; AMBIGUOUS with both hypotheses if a
-        second pose is supported about as well; and GATE if the trust is less than 1 - coverage.
+    The rejection, in the support's world, is GATE, with a hint, if the references disagree, the photograph contradicts
+    its intrinsics or the position's radius is too large; AMBIGUOUS with both hypotheses if a second pose is supported
+    about as well; and GATE if the trust is less than 1 - coverage. For `log10_chance` see `Priors.log10_chance`; `unit`
+    is the scene's unit of length, in messages.
     """
     votes = votes_of(support)
     evidence = evidence_of(support, votes)
     trust = trust_of(evidence, options, log10_chance)
     doubt = low_trust(evidence, trust, coverage)
-    contradicted = contradiction(support, votes, options, is_doubted=doubt is not None, unit=unit)
+    contradicted = contradiction(support, votes, unit, is_doubted=doubt is not None)
     return Judgement(trust, evidence, contradicted or doubt)
 
 
-def contradiction(
-    support: PosedSupport,
-    votes: Votes,
-    options: JudgeOptions,
-    is_doubted: bool = False,
-    unit: str = "m",
-) -> Rejection | None:
+def contradiction(support: PosedSupport, votes: Votes, unit: str, is_doubted: bool = False) -> Rejection | None:
     """Rejects a pose whose references, intrinsics or other matches contradict it, or whose radius is too large.
 
     For one that is doubted for lack of evidence see `wrong_camera`.
@@ -172,7 +144,7 @@ def contradiction(
         return disagreeing
     evidence = support.estimate.intrinsics
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
-    wrong = wrong_intrinsics(evidence, best, options.intrinsics) if evidence else None
+    wrong = wrong_intrinsics(evidence, best) if evidence else None
     if wrong:
         return wrong
     if wrong := wrong_camera(support, best, is_doubted):
@@ -261,10 +233,7 @@ def _ambiguous(hypotheses: tuple[PoseHypothesis, PoseHypothesis], unit: str) -> 
 
 
 def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, PoseHypothesis] | None:
-    """Finds a support's pose and its rival among the votes, as hypotheses in the support's world; None without a rival.
-
-    Projects all matches, and searches only if enough of them are outliers.
-    """
+    """Finds a support's pose and its rival among the votes, as hypotheses in the support's world; None without one."""
     estimate, camera = support.estimate, support.query.camera
     errors_px = votes.seen.errors_px(estimate.world_from_camera)
     own = errors_px < RIVAL_PNP.inlier_px

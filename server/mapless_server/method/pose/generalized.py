@@ -31,12 +31,7 @@ _rand_lock = threading.Lock()
 
 @dataclass(frozen=True, eq=False)
 class CameraMatches:
-    """One camera of a group, with its matches.
-
-    Attributes:
-        seen: its matches, M.
-        rig_from_camera: its pose in the rig; metres, or units of the rig's frame.
-    """
+    """One camera of a group, with M matches, and its pose in the rig; metres, or units of the rig's frame."""
 
     seen: PixelPoints
     rig_from_camera: RigidTransform
@@ -124,10 +119,7 @@ def scaled_ransac(
 
 @contextmanager
 def _repeatable() -> Iterator[None]:
-    """Makes PoseLib's generalized solvers repeatable: they rotate the problem by random numbers of the C library.
-
-    PoseLib's seed does not apply to these numbers.
-    """
+    """Makes PoseLib's generalized solvers repeatable: they take random numbers of the C library, whatever the seed."""
     with _rand_lock:
         _libc.srand(0)
         yield

@@ -88,10 +88,9 @@ class InformedPose:
 def informed_pose(
     seen: PixelPoints, found: RigidTransform | None, priors: Priors, inlier_px: float
 ) -> InformedPose | None:
-    """Chooses between the pose from the photograph and those from priors; None if there is none.
+    """Chooses between the pose `found` from the photograph alone and those from priors; None if there is none.
 
-    `found` is world_from_camera from the photograph alone, None if there is none; `inlier_px` the largest reprojection
-    error of a right match.
+    `inlier_px` is the largest reprojection error of a right match.
     """
 
     def cost(pose: RigidTransform) -> float:

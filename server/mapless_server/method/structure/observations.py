@@ -1,7 +1,6 @@
-"""Tracks: keypoints of several references that show one point, merged from pairwise matches; and their observations.
+"""Observations of points by references: residuals and derivatives, by which points are triangulated and adjusted.
 
-Observations have residuals and derivatives, by which points are triangulated and adjusted. Their arrays are in columns
-(see `optimize`), points (P, 3) are not.
+Arrays of observations are in columns (see `optimize`), points (P, 3) are not.
 """
 
 from __future__ import annotations
@@ -37,8 +36,7 @@ class KeypointNoise:
 
     Attributes:
         level_px: noise common to all keypoints: detection, and the effect of pose and lens errors in pixels.
-        slope: noise per diameter of the patch; a blob of 20 px is localized to a pixel, one of 3 px to a fifth.
-            Measured on photographs with surveyed poses.
+        slope: noise per diameter of the patch, measured on photographs with surveyed poses.
     """
 
     level_px: float
@@ -127,7 +125,8 @@ class Observations:
 
     def max_by_point(self, values: Array) -> Array:
         """Largest of values (O,) over each point's observations, (P,); infinite if one is NaN."""
-        return self.tracks.max_by_point(np.where(np.isnan(values), np.inf, values))
+        known, starts = np.where(np.isnan(values), np.inf, values), self.tracks.starts
+        return np.maximum.reduceat(known, starts) if len(starts) else known
 
     def weighted(self, noise: KeypointNoise) -> Observations:
         """Returns the same observations with another noise."""

@@ -1,8 +1,4 @@
-"""Features of a photograph whose raster is turned against those that it is compared with.
-
-Learned features describe what is upright: of a photograph turned by a quarter or half they match next to nothing. So
-they are found in the raster turned back, and put where they are in the photograph's own.
-"""
+"""Features of a photograph whose raster is turned: learned features describe what is upright, and match no others."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +18,7 @@ def extract_turned(
 ) -> View:
     """Finds the features of a photograph, see FeatureExtractor.extract, in its raster turned by 0 to 3 quarters.
 
-    Returns the view that the extractor gives, in pixels of the raster that is not turned; only its descriptors are
-    those of the turned one.
+    Returns the view in pixels of the raster that is not turned; only its descriptors are those of the turned one.
     """
     sides = camera.width_px, camera.height_px
     width, height = sides[::-1] if clockwise_quarter_turns % 2 else sides
