@@ -6,7 +6,8 @@ A network reconstructs several queries together, so the stages up to the metric 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from functools import partial
+from typing import TypeVar
 
 from mapless.geometry import Array
 
@@ -213,16 +214,19 @@ def reconstruct(batch: Sequence[Prepared]) -> list[Coarse | Exception]:
     """
     if len({id(prepared.pipeline.reconstructor) for prepared in batch}) > 1:
         raise ValueError("batch must have queries of one reconstructor only")
-    outcomes: list[Any] = _each(lambda prepared: prepared.context.check(), batch)
-    wanted = [prepared for prepared, outcome in zip(batch, outcomes, strict=True) if outcome is None]
+    stopped = [_tried(it.context.check) for it in batch]
+    wanted = [it for it, error in zip(batch, stopped, strict=True) if error is None]
     start_s = time.perf_counter()
     requests = [Request(it.query, it.references, it.correspondences, it.priors, it.is_metric) for it in wanted]
     made = iter(batch[0].pipeline.reconstructor.reconstruct_many(requests) if requests else [])
-    outcomes = [next(made) if outcome is None else outcome for outcome in outcomes]
+    outcomes = [next(made) if error is None else error for error in stopped]
     spent_s = time.perf_counter() - start_s
     for prepared in batch:
         prepared.context.add("coarse", spent_s)
-    return _each(_scaled, batch, outcomes)
+    return [
+        outcome if isinstance(outcome, Exception) else _tried(partial(_scaled, prepared, outcome))
+        for prepared, outcome in zip(batch, outcomes, strict=True)
+    ]
 
 
 def coarse_answer(coarse: Coarse) -> Answer | None:
@@ -255,16 +259,12 @@ def with_wide_correspondences(coarse: Coarse) -> Coarse:
     return _scaled(replace(prepared, correspondences=correspondences), reconstruction)
 
 
-def _each(work: Callable[..., T], *columns: Sequence[Any]) -> list[T | Exception]:
-    """Calls `work` for each row; an exception in a row, or raised by the call, is the result of that row."""
-    results: list[T | Exception] = []
-    for row in zip(*columns, strict=True):
-        failures = [value for value in row if isinstance(value, Exception)]
-        try:
-            results.append(failures[0] if failures else work(*row))
-        except Exception as error:
-            results.append(error)
-    return results
+def _tried(work: Callable[[], T]) -> T | Exception:
+    """The result of `work`, or what it raises: an error of one query does not fail the others."""
+    try:
+        return work()
+    except Exception as error:
+        return error
 
 
 def _scaled(prepared: Prepared, reconstruction: Outcome) -> Coarse:

@@ -57,7 +57,7 @@ def planted(
 def cost_by_point(observations: Observations, x_in_world: Array, scale: float) -> Array:
     """The cost (P,) as the module's equation has it, by a loop over observations."""
     cost = np.zeros(len(x_in_world))
-    for point, residual in zip(observations.point, observations.residuals(x_in_world).T, strict=True):
+    for point, residual in zip(observations.tracks.point, observations.residuals(x_in_world).T, strict=True):
         s = float(residual @ residual)
         cost[point] += 2 * scale**2 * (np.sqrt(1 + s / scale**2) - 1)
     return cost
@@ -65,7 +65,7 @@ def cost_by_point(observations: Observations, x_in_world: Array, scale: float) -
 
 def one_point(observations: Observations, point: int) -> Observations:
     """The observations of one point alone."""
-    mine = observations.point == point
+    mine = observations.tracks.point == point
     return Observations(
         Tracks(np.zeros(mine.sum(), np.intp), np.arange(mine.sum()), np.zeros(mine.sum(), np.intp)),
         take(observations.pixel, mine),
@@ -80,8 +80,8 @@ def one_point(observations: Observations, point: int) -> Observations:
 
 def add_outliers(observations: Observations, random: np.random.Generator, share: float) -> Observations:
     """The same with some observations anywhere within 60 px."""
-    wrong = random.random(len(observations.point)) < share
-    offset = random.uniform(-60, 60, (len(observations.point), 2)).T
+    wrong = random.random(len(observations.tracks.point)) < share
+    offset = random.uniform(-60, 60, (len(observations.tracks.point), 2)).T
     return replace(observations, pixel=observations.pixel + np.where(wrong, offset, 0.0))
 
 
@@ -247,7 +247,7 @@ def test_points_with_little_parallax_are_not_trusted() -> None:
 
 def test_points_with_large_residuals_are_not_trusted() -> None:
     _, observations, truth = planted("unfit", SceneOptions(noise_px=0.0, point_count=60))
-    wrong = np.zeros(len(observations.point), bool)
+    wrong = np.zeros(len(observations.tracks.point), bool)
     wrong[observations.tracks.starts[[3, 9]]] = True
     spoilt = replace(observations, pixel=observations.pixel + np.where(wrong, 5.0, 0.0))
     points = truth.copy()

@@ -129,7 +129,7 @@ class ViewColumns:
         view = observations.tracks.view
         order = np.argsort(view, kind="stable")
         focal, offset = take(observations.focal, order), take(observations.offset, order)
-        return ViewColumns(observations.point[order], view[order], view_count, focal, offset, planes=planes)
+        return ViewColumns(observations.tracks.point[order], view[order], view_count, focal, offset, planes=planes)
 
     @cached_property
     def parts(self) -> tuple[slice, ...]:

@@ -41,10 +41,15 @@ def intrinsics_checks(evidence: IntrinsicsEvidence) -> tuple[IntrinsicsCheck, ..
     change[0] = sent.focal_x_px * np.expm1(evidence.value[0])
     estimated, sigma, given_sigma = given + change, unit * evidence.sigma, unit * evidence.prior_sigma
     conflict, used = evidence.contradicted(ContradictionOptions(), evidence.prior_sigma), evidence.removed != 0
-    columns = zip(given, estimated, sigma, given_sigma, strict=True)
+    return _checks(np.stack([given, estimated, sigma, given_sigma], axis=1), conflict, used)
+
+
+def _checks(values: Array, conflict: NDArray[np.bool_], used: NDArray[np.bool_]) -> tuple[IntrinsicsCheck, ...]:
+    """The checks of all parameters; rows of `values` (4, 4) are given, estimated, and their standard deviations."""
+    rows = zip(IntrinsicsParameter, values.tolist(), conflict.tolist(), used.tolist(), strict=True)
     return tuple(
-        IntrinsicsCheck(parameter, *map(float, values), conflict=bool(conflict[i]), used=bool(used[i]))
-        for i, (parameter, values) in enumerate(zip(IntrinsicsParameter, columns, strict=True))
+        IntrinsicsCheck(parameter, given, estimated, sigma, given_sigma, conflict=is_wrong, used=is_used)
+        for parameter, (given, estimated, sigma, given_sigma), is_wrong, is_used in rows
     )
 
 
@@ -231,7 +236,7 @@ def wrong_camera(support: PosedSupport, best_reference: str, is_doubted: bool = 
     if best[0] < least * own:
         return None
     sent = query.photograph.camera if query.photograph else given
-    checks = tuple(_checks(sent, prior_sigma, given, best[1], steps))
+    checks = _differences(sent, prior_sigma, given, best[1], steps)
     named = ", ".join(map(_difference, checks))
     inliers = support.estimate.inliers
     message = f"{inliers.sum()} of {len(inliers)} matches agree with the pose; all together fit one of {named} better"
@@ -300,7 +305,9 @@ def _bend(camera: Camera) -> float:
     return 0.0 if camera.distortion is None else camera.distortion.cubic
 
 
-def _checks(sent: Camera, prior_sigma: Array, given: Camera, found: Camera, steps: _Steps) -> Iterator[IntrinsicsCheck]:
+def _differences(
+    sent: Camera, prior_sigma: Array, given: Camera, found: Camera, steps: _Steps
+) -> tuple[IntrinsicsCheck, ...]:
     """The parameters that differ, in pixels of the photograph as sent; standard deviations are those of the steps."""
     scale, uniform = sent.width_px / found.width_px, 1 / np.sqrt(12)
     of_sent, centre_sigma_px = _parameters(sent), sent.width_px / 20
@@ -311,8 +318,5 @@ def _checks(sent: Camera, prior_sigma: Array, given: Camera, found: Camera, step
     sigma = np.array([focal_sigma_px, centre_sigma_px, centre_sigma_px, _k1_step(given, steps) * uniform])
     estimated = of_sent + np.array([scale, scale, scale, 1.0]) * (after - before)
     given_sigma = np.array([sent.focal_x_px, scale, scale, 1.0]) * prior_sigma
-    differs = after != before
-    for i, parameter in enumerate(IntrinsicsParameter):
-        if differs[i]:
-            values = float(of_sent[i]), float(estimated[i]), float(sigma[i]), float(given_sigma[i])
-            yield IntrinsicsCheck(parameter, *values, conflict=True, used=False)
+    values = np.stack([of_sent, estimated, sigma, given_sigma], axis=1)
+    return tuple(it for it in _checks(values, after != before, np.zeros(4, bool)) if it.conflict)

@@ -75,7 +75,8 @@ def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_pri
     advice, message = _advice(case)
     share = query.photograph.ignored_share if query.photograph else 0.0
     if share >= MUCH_IGNORED or (share > 0 and case.features < FEW_FEATURES):
-        message += f" The mask ignores {_percent(share)} of the image: 0 means ignore, every other value use."
+        percent = f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
+        message += f" The mask ignores {percent} of the image: 0 means ignore, every other value use."
     hint = Hint(_STAGES.get(rejection.reason, "judge") if references else "", advice, message, case.best)
     return replace(answer, outcome=replace(rejection, hint=hint))
 
@@ -149,10 +150,6 @@ def _of_overlap(case: _Case) -> tuple[Advice, str]:
         Advice.LOOK_AT_REFERENCE,
         f"Point the camera at what the best reference shows, or add references from nearer: {shared}.",
     )
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
 
 
 def _retake(case: _Case) -> str:

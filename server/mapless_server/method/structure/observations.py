@@ -77,11 +77,6 @@ class Observations:
     focal_px: Array
     principal_px: Array
 
-    @property
-    def point(self) -> NDArray[np.intp]:
-        """Index (O,) of each observation's point."""
-        return self.tracks.point
-
     @cached_property
     def focal(self) -> Array:
         """Focal lengths (2, O), divided by the keypoint's standard deviation."""
@@ -94,7 +89,7 @@ class Observations:
 
     def in_camera(self, x_in_world: Array) -> Array:
         """The point (3, O) of each observation in its camera's frame, from points (P, 3)."""
-        return apply_columns(self.rotation, take(columns(x_in_world), self.point)) + self.translation
+        return apply_columns(self.rotation, take(columns(x_in_world), self.tracks.point)) + self.translation
 
     def residuals(self, x_in_world: Array) -> Array:
         """Projection minus observation (2, O) of points (P, 3), in standard deviations; NaN behind the camera."""
@@ -127,10 +122,6 @@ class Observations:
         """Largest of values (O,) over each point's observations, (P,); infinite if one is NaN."""
         known, starts = np.where(np.isnan(values), np.inf, values), self.tracks.starts
         return np.maximum.reduceat(known, starts) if len(starts) else known
-
-    def weighted(self, noise: KeypointNoise) -> Observations:
-        """Returns the same observations with another noise."""
-        return replace(self, sigma_px=noise.sigma_px(self.size_px))
 
     def prune(self, chosen: NDArray[np.bool_], x_in_world: Array) -> tuple[Observations, Array]:
         """Keeps the chosen observations (O,) and the points (P, 3) that have at least two of them."""

@@ -177,7 +177,7 @@ def refine_points(observations: Observations, x_in_world: Array, options: Struct
         points = adjust_points(observations, points, options.loss_scale_sigma, options.iterations)
         if options.model_noise:
             noise = estimate_noise(observations, points, noise)
-            observations = observations.weighted(noise)
+            observations = replace(observations, sigma_px=noise.sigma_px(observations.size_px))
         if options.max_residual_sigma is not None:
             # A track with one wrong match has right observations too.
             explained = length(observations.residuals(points).T) < options.max_residual_sigma
@@ -190,9 +190,9 @@ def trustworthy(observations: Observations, x_in_world: Array, options: Structur
     """Which points (P,) are finite, fit all their observations and have enough parallax."""
     limit = options.max_residual_sigma
     explained = observations.max_by_point(length(observations.residuals(x_in_world).T)) < (limit or np.inf)
-    direction = take(columns(x_in_world), observations.point) - observations.rays()[0]
+    direction = take(columns(x_in_world), observations.tracks.point) - observations.rays()[0]
     direction = direction / (direction**2).sum(0) ** 0.5
-    cosine = (direction * take(direction, observations.tracks.starts[observations.point])).sum(0)
+    cosine = (direction * take(direction, observations.tracks.starts[observations.tracks.point])).sum(0)
     parallax_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
     return np.asarray(explained & (observations.max_by_point(parallax_deg) >= options.min_parallax_deg))
 
