@@ -15,12 +15,12 @@ from mapless_server.observability.metrics import Metrics
 from mapless_server.serve import assembly
 from mapless_server.serve.assembly import (
     StartupError,
-    choose_device,
     feature_names,
     make_engine,
     make_first_features,
     make_tiers,
 )
+from mapless_server.serve.devices import choose_device
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 

@@ -44,6 +44,8 @@ from mapless_server.store import Store, StoreError
 from mapless_server.store.depths import depth_kind
 from mapless_server.store.pairs import PairStore
 
+from .devices import choose_device
+
 log = logging.getLogger(__name__)
 
 WITHOUT_WEIGHTS = "sift"
@@ -308,37 +310,6 @@ def _present(tiers: Iterable[Sequence[str]], settings: Settings) -> Iterator[str
             if name not in WITH_WEIGHTS or look_up(named(name), settings.weights_dir).status is not Status.ABSENT:
                 yield name
                 break
-
-
-def choose_device(device: str) -> str:
-    """Chooses the device of networks; `auto` is a CUDA device if torch is installed and finds one, else the CPU.
-
-    ValueError if there is no such device.
-    """
-    chosen = _find_device(device)
-    if chosen != "cpu":
-        import torch
-
-        # On new GPUs torch prefers cuDNN's attention, which plans for half a second for each new number of keypoints of
-        # LightGlue. To be set before there are threads.
-        torch.backends.cuda.enable_cudnn_sdp(False)
-    return chosen
-
-
-def _find_device(device: str) -> str:
-    if device == "cpu":
-        return device
-    try:
-        import torch
-    except ImportError:
-        if device == "auto":
-            return "cpu"
-        raise
-    if device == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if torch.device(device).index not in (None, *range(torch.cuda.device_count())) or not torch.cuda.is_available():
-        raise ValueError(f"there is no device {device}: torch finds {torch.cuda.device_count()} CUDA devices")
-    return device
 
 
 def _make_extractors(settings: Settings, device: str, missing: _Missing) -> dict[str, FeatureExtractor]:
