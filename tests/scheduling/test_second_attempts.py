@@ -208,3 +208,15 @@ def test_the_only_job_leaves_room_for_the_next_caller() -> None:
     other = toy.admit(client="other", deadline_s=5.0)
     assert toy.take("host").jobs == (other,)
     assert toy.ending_of(job) is None
+
+
+def test_a_further_step_of_an_earlier_stage_has_its_turn() -> None:
+    """Beside those of other callers, which wait for a later stage."""
+    toy, jobs = Toy(), list[AnyJob]()
+    for i, stage in enumerate(["prepare", *["refine"] * 30]):
+        jobs.append(toy.admit(stage="refine", client=f"doubtful {i}"))
+        toy.finish(toy.take("host"), Next((Step(stage, "toy", "b", i),), Fallback(lambda _: Done(None), FAR_S)))
+    while not jobs[0].is_over:
+        toy.fill("busy")
+        toy.finish(toy.take("host"), Done(None))
+    assert sum(it.is_over for it in jobs) < len(jobs) / 2

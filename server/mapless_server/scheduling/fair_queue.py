@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Iterator
 from typing import Generic, TypeVar
 
 from .jobs import Flow
-from .shares import Shares
+from .shares import Shares, Turn
 
 J = TypeVar("J", bound=Hashable)
 
@@ -40,10 +40,10 @@ class FairQueue(Generic[J]):
         """Sum of the costs of all waiting jobs."""
         return self._cost_s if self._flow_of else 0.0  # without rounding errors
 
-    @property
-    def turn(self) -> tuple[float | int, ...] | None:
-        """That of the client who is served next, by `Shares.turn`; None if nothing waits."""
-        return min(map(self._shares.turn, self._jobs), default=None)
+    def turn(self, is_allowed: Callable[[J], bool]) -> Turn | None:
+        """That of the client whose job is computed next, of the allowed jobs; None if none waits."""
+        flows = (flow for flow, jobs in self._jobs.items() if any(map(is_allowed, jobs)))
+        return min(map(self._shares.turn, flows), default=None)
 
     def push(self, job: J, flow: Flow, cost_s: float) -> None:
         """Adds a job behind those of its client."""
@@ -81,14 +81,15 @@ FURTHER = "further steps\n"
 class FurtherQueue(FairQueue[J]):
     """Waiting jobs whose further steps were not admitted: together they get the share of one more caller.
 
-    However many callers there are whose photographs are tried again and again, the others then keep their shares.
+    However many callers there are whose photographs are tried again and again, they take no more from the others than
+    one more caller would, without credit for time in which there were none.
     Among the further steps those of each caller get an equal share.
     """
 
     def push(self, job: J, flow: Flow, cost_s: float) -> None:
         """Adds a job behind those of its caller."""
         flow = further(flow)
-        self._shares.enter(flow)
+        self._shares.enter(flow, caller_credit_s=0.0)
         super().push(job, flow, cost_s)
 
     def remove(self, job: J) -> float:

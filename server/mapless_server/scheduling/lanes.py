@@ -1,7 +1,7 @@
 """Lanes of threads, and how many jobs of a bucket fit in memory together: what the scheduler keeps of them."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from .fair_queue import FairQueue, FurtherQueue
@@ -36,11 +36,12 @@ class Lane:
     long: set[int] = field(default_factory=set)
     arrivals: deque[tuple[Flow, float, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
 
-    @property
-    def is_turn_of_aside(self) -> bool:
-        """Whether those that wait aside come before those that wait in order."""
-        aside, in_order = ([turn for it in of if (turn := it.turn)] for of in (self.aside, self.queues))
-        return bool(aside) and (not in_order or min(aside) < min(in_order))
+    def stage_of_aside(self, is_allowed: Callable[[AnyJob], bool]) -> Stage | None:
+        """The stage of the job aside whose turn it is; None if one that waits in order comes first, or none waits."""
+        turns = [(turn, -i) for i, it in enumerate(self.aside) if (turn := it.turn(is_allowed))]
+        in_order = [turn for it in self.queues if (turn := it.turn(is_allowed))]
+        first = min(turns, default=None)
+        return self.stages[-first[1]] if first and (not in_order or first[0] < min(in_order)) else None
 
     @property
     def has_one_left(self) -> bool:

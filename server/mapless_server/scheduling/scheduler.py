@@ -177,10 +177,10 @@ class Scheduler:
             return not (expected.shorter(job.flow, step_s) or expected.first(job.flow))
 
         waiting = [it for it, queue in zip(lane.stages, lane.queues, strict=True) if any(map(is_allowed, queue))]
-        if not waiting or lane.is_turn_of_aside:
-            batch = self._take_aside(lane, is_allowed, now_s)
-            if batch is not None or not waiting:
-                return batch
+        if (aside := lane.stage_of_aside(is_allowed)) is not None:
+            return self._take_aside(lane, aside, is_allowed, now_s)
+        if not waiting:
+            return None
         # Late stages first: jobs that have begun hold memory, and time has been spent on them.
         is_first_due = lane.passed_over >= FIRST_STAGE_INTERVAL - 1
         stage = waiting[0] if is_first_due else waiting[-1]
@@ -190,17 +190,14 @@ class Scheduler:
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         return self._begin(lane, stage, jobs, now_s)
 
-    def _take_aside(self, lane: Lane, is_allowed: Callable[[AnyJob], bool], now_s: float) -> Batch | None:
-        """Selects further steps that wait aside."""
-        stages = [it for it, queue in zip(lane.stages, lane.aside, strict=True) if any(map(is_allowed, queue))]
-        if not stages:
-            return None
-        jobs = self._pop_batch(self._aside[stages[-1].name], stages[-1], is_allowed, now_s)
+    def _take_aside(self, lane: Lane, stage: Stage, is_allowed: Callable[[AnyJob], bool], now_s: float) -> Batch:
+        """Selects further steps that wait aside for a stage."""
+        jobs = self._pop_batch(self._aside[stage.name], stage, is_allowed, now_s)
         for job in jobs:
             job.begins_until_s = None
             self._timers.set(job)
             self._ledger.resume(job, self._admission.bookable(self._stage_costs.of(job.step, job.flow, now_s)))
-        return self._begin(lane, stages[-1], jobs, now_s)
+        return self._begin(lane, stage, jobs, now_s)
 
     def _begin(self, lane: Lane, stage: Stage, jobs: tuple[AnyJob, ...], now_s: float) -> Batch:
         lane.free -= 1

@@ -8,6 +8,8 @@ from .jobs import Flow
 
 CREDIT_S = 10.0
 """Computing time by which a member that has used less than others may be preferred, when it comes again."""
+Turn = tuple[float | int, ...]
+"""Sorts clients in the order in which they are served."""
 MAX_IDLE = 100
 """Members of a group without jobs of which it is kept what they have been given."""
 
@@ -33,7 +35,7 @@ class _Member:
         self.active: dict[str, _Member] = {}
         self.idle: OrderedDict[str, _Member] = OrderedDict()
 
-    def begin_s(self, name: str) -> float:
+    def begin_s(self, name: str, credit_s: float = CREDIT_S) -> float:
         """The `served_s` of a member, or that with which it would begin.
 
         A new one begins with an equal share, so that ever new ones do not keep an old one waiting. One that has had
@@ -42,13 +44,13 @@ class _Member:
         if (member := self.active.get(name)) is not None:
             return member.served_s
         known = self.idle.get(name)
-        return self.equal_s if known is None else max(known.served_s, self.least_s - CREDIT_S)
+        return self.equal_s if known is None else max(known.served_s, self.least_s - credit_s)
 
-    def enter(self, name: str, number: int) -> "_Member":
+    def enter(self, name: str, number: int, credit_s: float) -> "_Member":
         """Counts a job of a member."""
         member = self.active.get(name)
         if member is None:
-            begin_s = self.begin_s(name)
+            begin_s = self.begin_s(name, credit_s)
             member = self.active[name] = self.idle.pop(name) if name in self.idle else _Member()
             member.served_s, member.number = begin_s, number
         member.jobs += 1
@@ -88,11 +90,11 @@ class Shares:
         self._all = _Member()
         self._numbers = itertools.count()
 
-    def enter(self, flow: Flow) -> None:
-        """Counts a job of a client."""
+    def enter(self, flow: Flow, caller_credit_s: float = CREDIT_S) -> None:
+        """Counts a job of a client; its caller, if it was away, is preferred by at most so much computing time."""
         member, number = self._all, next(self._numbers)
-        for name in flow:
-            member = member.enter(name, number)
+        for name, credit_s in zip(flow, (CREDIT_S, caller_credit_s, CREDIT_S), strict=True):
+            member = member.enter(name, number, credit_s)
 
     def leave(self, flow: Flow) -> None:
         """Undoes `enter`."""
@@ -110,7 +112,7 @@ class Shares:
                 return
             member = member.charge(name, seconds)
 
-    def turn(self, flow: Flow) -> tuple[float | int, ...]:
+    def turn(self, flow: Flow) -> Turn:
         """Sorts clients that have jobs in the order in which they are served."""
         return tuple(key for it in self._members(flow) for key in (it.served_s, it.number))
 

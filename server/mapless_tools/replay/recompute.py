@@ -292,10 +292,10 @@ def followed(
 ) -> tuple[SearchStep, bool]:
     """The step of the attempt that came next in a captured answer, and whether that had a result.
 
-    The first step where the captured answer had no further attempt, as those of servers that did not list them.
+    Attempts that are not made any more are passed over. The first step where the captured answer had no further
+    attempt, as those of servers that did not list them.
     """
-    count = len(following.steps[0].payload.attempts)
-    for captured in then[count : count + 1]:
+    for captured in then[len(following.steps[0].payload.attempts) :]:
         for step in following.steps:
             search = step.payload
             if (search.rung, tiers[search.attempt.features].features) == (captured.rung, captured.features):

@@ -13,10 +13,16 @@ from .asking import RIGHT_DEG, RIGHT_M, RIGHT_SHARE, Row
 def answers_of(file: Path) -> Iterator[tuple[str, list[Row]]]:
     """The outcome of each photograph, which is "right", "wrong" or another word, and its attempts."""
     content = json.loads(file.read_text())
-    if "answers" in content:
-        yield from ((it["outcome"], it["attempts"]) for it in content["answers"])
-    else:
-        yield from ((_outcome(it), it["attempts"]) for it in content["per_query"])
+    try:
+        if "answers" in content:
+            found = [(it["outcome"], it.get("attempts", [])) for it in content["answers"]]
+        else:
+            found = [(_outcome(it), it["attempts"]) for it in content["per_query"]]
+    except (TypeError, KeyError) as error:
+        raise ValueError(f"{file} has no answers, or none with attempts: {error!r}") from None
+    if any(isinstance(attempt, str) for _, attempts in found for attempt in attempts):
+        raise ValueError(f"{file} is of an earlier version, whose attempts are sentences")
+    yield from found
 
 
 def _outcome(query: Mapping[str, float]) -> str:

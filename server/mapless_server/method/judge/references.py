@@ -72,7 +72,7 @@ def disagreeing_references(photographs: Sequence[Supporters]) -> Rejection | Non
         f"they show in common is {sorted(errors_px)[len(errors_px) // 2]:.0f} px off, in the median (of an image of "
         f"1024 pixels, at most {MAX_ERROR_PX:g})"
     )
-    return _wrong_references(message, photographs)
+    return _wrong_references(message, [it for it in photographs if it.errors_px()])
 
 
 def without_agreement(photographs: Sequence[Supporters]) -> Rejection | None:
