@@ -149,6 +149,11 @@ class Coarse:
     reconstruction: Outcome
     scale: MetricScale | Rejection
 
+    @property
+    def rejected_alone(self) -> Rejection | None:
+        """Why the photograph gives no initial pose without its priors; None if it does, or if that is not known."""
+        return self.reconstruction.without_priors if isinstance(self.reconstruction, Triangulation) else None
+
     def answer(self, outcome: Localization | Rejection, support: Support | None = None) -> Answer:
         """Makes the answer in the caller's world from an outcome in the world of `prepared`."""
         prepared, scale = self.prepared, None if isinstance(self.scale, Rejection) else self.scale

@@ -12,7 +12,7 @@ from .features.views import Reconstruction
 from .judge.answer import Answer, Localization
 from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
-from .judge.hypothesis import Attempt, Found, Solver, found_by
+from .judge.hypothesis import Attempt, Doubt, Found, Solver, doubt_of, found_by
 from .judge.judge import contradiction, judge, one_reference_failure, trust_of_score
 from .judge.references import unmoved_failure
 from .judge.two_view import (
@@ -43,7 +43,10 @@ def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
     if attempt.solver is Solver.LINES:
         return found_by(attempt, _from_lines(coarse), doubt)
     made = with_wide_correspondences(coarse) if attempt.matching.is_wide else coarse
-    return found_by(attempt, _from_points(made), doubt)
+    answer, alone = _from_points(made), made.rejected_alone
+    # If only the priors gave an initial pose, and no answer, the photograph lacks what it lacks without them.
+    doubts = doubt_of(alone) if alone and isinstance(answer.outcome, Rejection) else Doubt.NONE
+    return found_by(attempt, answer, doubt, doubts)
 
 
 def _from_points(coarse: Coarse) -> Answer:

@@ -30,12 +30,14 @@ class Triangulation:
         structure: the points, in the world of the references.
         world_from_query: the query's initial pose.
         point, keypoint: (M,) points that agree with this pose, and the query's keypoints that match them.
+        without_priors: why the photograph alone gives no initial pose; None if this is its own.
     """
 
     structure: Structure
     world_from_query: RigidTransform
     point: NDArray[np.intp]
     keypoint: NDArray[np.intp]
+    without_priors: Rejection | None = None
 
 
 Outcome: TypeAlias = Reconstruction | Triangulation | Rejection

@@ -86,6 +86,7 @@ class GeometricReconstructor:
         enough = len(matches) >= MIN_MATCHES
         pose = ransac(seen, None, PNP) if enough else None
         rejection, inliers = self._judge(query, structure, matches, pose, NO_PRIORS)
+        without_priors = rejection
         if rejection and enough and priors:
             informed = informed_pose(seen, pose, priors, PNP.inlier_px)
             pose = informed.world_from_camera if informed else None
@@ -97,7 +98,7 @@ class GeometricReconstructor:
             # With too few matches here, the pose prior is the initial pose from which more are searched.
             pose, inliers = known.world_from_camera, np.zeros(len(matches), bool)
         assert pose is not None
-        return Triangulation(structure, pose, matches.point[inliers], matches.keypoint[inliers])
+        return Triangulation(structure, pose, matches.point[inliers], matches.keypoint[inliers], without_priors)
 
     def _judge(
         self, query: View, structure: Structure, matches: PointMatches, pose: RigidTransform | None, priors: Priors
