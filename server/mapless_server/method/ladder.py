@@ -150,6 +150,9 @@ RUNGS = (
 )
 """The rungs in the order in which they are tried, after the first attempt: near a pose prior, or as it is."""
 
+NAMES = tuple(it.name for it in RUNGS)
+"""Their names, in this order. Evidence: rungs."""
+
 
 def first_attempt(situation: Situation) -> tuple[str, Attempt]:
     """The rung's name and the attempt that begins."""
