@@ -35,7 +35,7 @@ def test_a_further_step_waits_for_an_idle_thread(kind: str, others: int, is_last
 
 
 def test_further_steps_together_have_the_share_of_one_caller() -> None:
-    """Of however many callers they are, beside one whose jobs never end."""
+    """However many callers they have, beside one whose jobs never end."""
     toy, asides = Toy(), list[bool]()
     for i in range(20):
         toy.admit(stage="refine", client=f"doubtful {i}")

@@ -1,4 +1,4 @@
-"""What each rung of the ladder earned, from files of answers, and from those that `mapless-server evaluate` writes."""
+"""The worth of each rung of the ladder, from files of answers, and from those that `mapless-server evaluate` writes."""
 
 import json
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Which poses are of one place, and when one place is clearly better than another: the constants of the one rule.
+"""The constants of the one rule: when poses are of one place, and when a place is clearly better than another.
 
 The attempts of each photograph are computed once, with SIFT; each alternative decides between the same results.
 """

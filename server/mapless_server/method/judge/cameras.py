@@ -139,7 +139,7 @@ LINES = RelativePoseOptions(min_iterations=50, max_iterations=150, pair_iteratio
 
 @dataclass(frozen=True)
 class _Steps:
-    """Which other cameras are tried: so many focal lengths, and values of k1 (`lens`), on either side of those given.
+    """Other cameras that are tried: so many focal lengths, and values of k1 (`lens`), on either side of those given.
 
     There are `per_octave` focal lengths from one to its double. A value of k1 moves the image's corner by `bend`, a
     share of its distance from the principal point, against the next.

@@ -1,4 +1,4 @@
-"""What a pose rests on: references that agree with their own poses, and matches that are not fixed to the camera.
+"""The support of a pose: references that agree with their own poses, and matches that are not fixed to the camera.
 
 No pose is right that rests on references which do not agree with their own poses, however many matches it explains.
 Their agreement is known from matches that took no part in the pose.
