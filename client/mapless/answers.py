@@ -156,11 +156,24 @@ class Hint:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A possible pose of the photograph, its inliers, and the names of the references that support it."""
+    """A possible pose of the photograph; it is no answer.
+
+    Attributes:
+        world_from_camera: as of `LocalizationResult`.
+        inlier_count: number of matches that agree with it.
+        references: names of the references that support it.
+        covariance, accuracy: as of `LocalizationResult`, of a pose that is rejected for its radius alone; else None.
+        arbitrary_unit, in_axes, geo_pose: likewise.
+    """
 
     world_from_camera: RigidTransform
     inlier_count: int
     references: tuple[str, ...]
+    covariance: Array | None = None
+    accuracy: Accuracy | None = None
+    arbitrary_unit: bool = False
+    in_axes: FramedPose | None = None
+    geo_pose: GeoPose | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +262,8 @@ class Rejected:
         reason: for programs: the value of RejectionReason without its prefix, "LOW_OVERLAP".
         message: one sentence for a person, with the numbers that decided.
         hint: advice.
-        hypotheses: contradictory poses, the best supported first, if the reason is "AMBIGUOUS".
+        hypotheses: contradictory poses, the best supported first, if the reason is "AMBIGUOUS"; or, if
+            `include_imprecise_pose` was asked for, the one that is rejected for its radius alone, with its accuracy.
         intrinsics_checks: comparison of the intrinsics with the photograph, if a conflict is the reason.
         debug: the matches, if requested and found.
         capture_time, session_from_camera: as they were sent.
@@ -268,8 +282,15 @@ class Rejected:
     is_final: bool = field(default=True, init=False)
 
     def __str__(self) -> str:
-        text = rejection_text(self.reason, self.message, self.hint)
-        return f"{text}\n  {_CAPTURED}" if self.diagnostics.captured else text
+        text = [rejection_text(self.reason, self.message, self.hint)]
+        for it in (it for it in self.hypotheses if it.accuracy is not None):
+            pose, frame = it.world_from_camera, ""
+            if it.in_axes is not None and it.in_axes.axes != "OPENCV":
+                pose, frame = it.in_axes.world_from_camera, f", in {it.in_axes.axes} axes"
+            text += [f"  the pose that is too imprecise{frame}:", *pose_lines(pose, it.accuracy, it.arbitrary_unit)]
+        if self.diagnostics.captured:
+            text.append(f"  {_CAPTURED}")
+        return "\n".join(text)
 
 
 def rejection_text(reason: str, message: str, hint: Hint | None) -> str:

@@ -66,6 +66,7 @@ class ImageReport:
         rejected_alone: reason of its rejection if localized alone, "LOW_OVERLAP"; None if it would be accepted.
         diagnostics: its inputs and times.
         prior_checks: how the joint pose compares with each of its soft priors.
+        hypotheses_alone: as of `Rejected`, if it is rejected alone.
     """
 
     inlier_count: int
@@ -73,6 +74,7 @@ class ImageReport:
     rejected_alone: str | None
     diagnostics: Diagnostics
     prior_checks: tuple[PriorCheck, ...] = ()
+    hypotheses_alone: tuple[Hypothesis, ...] = ()
 
 
 @dataclass(frozen=True)

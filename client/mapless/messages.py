@@ -14,7 +14,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from . import names, wire
-from .answers import Accuracy, LocalizationResult, Rejected
+from .answers import Accuracy, Hypothesis, LocalizationResult, Rejected
 from .diagnostics import Attempt, Debug, Diagnostics
 from .geodesy import Datum, GeoPose
 from .geometry import Array, Camera, Quaternion, RigidTransform, Similarity
@@ -120,7 +120,9 @@ def _image_report(message: Any, path: str) -> ImageReport:
     alone = message.alone
     reason = alone.DESCRIPTOR.fields_by_name["reason"].enum_type
     rejected_alone = wire.value_name(reason, alone.reason) if message.HasField("alone") else None
-    return read(ImageReport, message, path, rejected_alone=rejected_alone)
+    given = alone.hypotheses
+    hypotheses = tuple(read(Hypothesis, it, f"{path}.alone.hypotheses[{i}]") for i, it in enumerate(given))
+    return read(ImageReport, message, path, rejected_alone=rejected_alone, hypotheses_alone=hypotheses)
 
 
 _READERS: dict[Any, Callable[[Any, str], Any]] = {

@@ -14,7 +14,7 @@ from support.scenes import random_for
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless.scenes import Calibration
 from mapless_server.method.bundle.estimate import SELF_TAIL_95, TAIL_95, USUAL_GAP, Accuracy, accuracy_from_covariance
-from mapless_server.services.messages.answers import (
+from mapless_server.services.messages.radii import (
     Conditions,
     Factors,
     reported_radii,

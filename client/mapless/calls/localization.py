@@ -49,6 +49,7 @@ async def _localize_request(
     confidential: bool = False,
     axes: Axes | str = "",
     include_debug: bool = False,
+    include_imprecise_pose: bool = False,
     capture_time: datetime | None = None,
     session_from_camera: RigidTransform | None = None,
     mask: ImageSource | None = None,
@@ -80,6 +81,8 @@ async def _localize_request(
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: the axes of `session_from_camera`
             and of `LocalizationResult.in_axes`.
         include_debug: whether the answer includes the matches that support it.
+        include_imprecise_pose: whether a rejection for the radius of the position alone includes the pose, as the only
+            one of `Rejected.hypotheses`, with its accuracy: for those to whom a direction or a rough place is of use.
         capture_time: time of the photograph, with time zone; returned with the answer.
         session_from_camera: the device's own pose at that time; returned with the answer, and used for
             `LocalizationResult.world_from_session`.
@@ -102,6 +105,7 @@ async def _localize_request(
             rerank_references=rerank_references,
             axes=wire.enum_value(pb.Axes, axes),
             include_debug=include_debug,
+            include_imprecise_pose=include_imprecise_pose,
             coverage=coverage,
             ignore_calibration=ignore_calibration,
             confidential=confidential,
@@ -181,6 +185,7 @@ async def localize_rig(
     reference_count: int = 0,
     coverage: float = 0.0,
     confidential: bool = False,
+    include_imprecise_pose: bool = False,
     capture_time: datetime | None = None,
     session_from_rig: RigidTransform | None = None,
     timeout_s: float | None = None,
@@ -195,6 +200,7 @@ async def localize_rig(
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
         confidential: see `localize`.
+        include_imprecise_pose: see `localize`; concerns `ImageReport.hypotheses_alone`.
         capture_time: time of the photographs, with time zone; returned with the answer.
         session_from_rig: the device's own pose of the rig at that time, OpenCV's axes; used for
             `RigLocalization.world_from_session`.
@@ -206,7 +212,12 @@ async def localize_rig(
             await connection.unblocked(_rig_image_to_message, image, scene, field)
             for field, image in wire.listed(images, RigImage, "images")
         ],
-        options=_options_to_message(reference_count=reference_count, coverage=coverage, confidential=confidential),
+        options=_options_to_message(
+            reference_count=reference_count,
+            coverage=coverage,
+            confidential=confidential,
+            include_imprecise_pose=include_imprecise_pose,
+        ),
     )
     if capture_time is not None:
         wire.set_time(request.capture_time, capture_time, "capture_time")
@@ -224,6 +235,7 @@ async def localize_sequence(
     reference_count: int = 0,
     coverage: float = 0.0,
     confidential: bool = False,
+    include_imprecise_pose: bool = False,
     axes: Axes | str = "",
     timeout_s: float | None = None,
 ) -> SequenceLocalization | GroupRejected:
@@ -239,6 +251,7 @@ async def localize_sequence(
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
         confidential: see `localize`.
+        include_imprecise_pose: see `localize`; concerns `ImageReport.hypotheses_alone`.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: the axes of the device's poses
             and of `SequenceLocalization.world_from_session`.
         timeout_s: deadline of the call.
@@ -253,6 +266,7 @@ async def localize_sequence(
             reference_count=reference_count,
             coverage=coverage,
             confidential=confidential,
+            include_imprecise_pose=include_imprecise_pose,
             axes=wire.enum_value(pb.Axes, axes),
         ),
     )

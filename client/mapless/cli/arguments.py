@@ -341,6 +341,10 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
         help="accept a coarse pose if time runs out; with --progressive, print it first",
     )  # fmt: skip
     command.add_argument(
+        "--include-imprecise-pose", action="store_true",
+        help="with a rejection for the radius of the position alone, print the pose too, with its radii",
+    )  # fmt: skip
+    command.add_argument(
         "--progressive", action="store_true", help="print each better answer as soon as there is one, then the last"
     )
     command.add_argument("--parallel", type=int, default=2, help="concurrent calls for a folder (default: %(default)s)")

@@ -223,6 +223,7 @@ def _answers(
         "rerank_references": arguments.rerank,
         "coverage": arguments.coverage,
         "axes": arguments.axes,
+        "include_imprecise_pose": arguments.include_imprecise_pose,
         "include_debug": arguments.debug or arguments.draw is not None,
     }
     photograph = image, photo.camera, arguments.scene, arguments.reference

@@ -111,13 +111,17 @@ def accuracy_section(answer: LocalizationResult) -> str:
 
 
 def hypotheses_section(answer: Rejected) -> str:
-    """Contradictory poses."""
+    """The poses of a rejection: those that contradict each other, or the one that is not precise enough."""
     rows = []
     for letter, it in zip("ABCDEFGH", answer.hypotheses, strict=False):
         t = it.world_from_camera.translation
         named = ", ".join(text(reference_id(name)) for name in it.references)
-        rows.append([letter, ", ".join(f"{v:.3f}" for v in t), str(it.inlier_count), named])
-    return section("Where it could be", table(("", "position, m", "inliers", "supported by"), rows)) if rows else ""
+        radii = (
+            "" if it.accuracy is None else f"{it.accuracy.position_95_m:.3g}, {it.accuracy.rotation_95_deg:.2g}&deg;"
+        )
+        rows.append([letter, ", ".join(f"{v:.3f}" for v in t), radii, str(it.inlier_count), named])
+    head = ("", "position, m", "95 % within, m", "inliers", "supported by")
+    return section("Where it could be", table(head, rows)) if rows else ""
 
 
 def priors_section(checks: Sequence[PriorCheck]) -> str:

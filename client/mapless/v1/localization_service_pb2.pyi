@@ -259,7 +259,7 @@ class PosePrior(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ...) -> None: ...
 
 class LocalizeOptions(_message.Message):
-    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage", "ignore_calibration", "confidential")
+    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage", "ignore_calibration", "confidential", "include_imprecise_pose")
     VARIANT_FIELD_NUMBER: _ClassVar[int]
     SCALE_STRATEGY_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -270,6 +270,7 @@ class LocalizeOptions(_message.Message):
     COVERAGE_FIELD_NUMBER: _ClassVar[int]
     IGNORE_CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     CONFIDENTIAL_FIELD_NUMBER: _ClassVar[int]
+    INCLUDE_IMPRECISE_POSE_FIELD_NUMBER: _ClassVar[int]
     variant: Variant
     scale_strategy: ScaleStrategy
     reference_count: int
@@ -280,7 +281,8 @@ class LocalizeOptions(_message.Message):
     coverage: float
     ignore_calibration: bool
     confidential: bool
-    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ..., ignore_calibration: bool = ..., confidential: bool = ...) -> None: ...
+    include_imprecise_pose: bool
+    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ..., ignore_calibration: bool = ..., confidential: bool = ..., include_imprecise_pose: bool = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
     __slots__ = ("localization", "rejection", "diagnostics", "capture_time", "session_from_camera", "debug")
@@ -463,14 +465,24 @@ class Hint(_message.Message):
     def __init__(self, stage: _Optional[str] = ..., advice: _Optional[_Union[Advice, str]] = ..., message: _Optional[str] = ..., best_reference: _Optional[str] = ...) -> None: ...
 
 class Hypothesis(_message.Message):
-    __slots__ = ("world_from_camera", "inlier_count", "references")
+    __slots__ = ("world_from_camera", "inlier_count", "references", "covariance", "accuracy", "arbitrary_unit", "in_axes", "geo_pose")
     WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    ACCURACY_FIELD_NUMBER: _ClassVar[int]
+    ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
+    IN_AXES_FIELD_NUMBER: _ClassVar[int]
+    GEO_POSE_FIELD_NUMBER: _ClassVar[int]
     world_from_camera: _geometry_pb2.RigidTransform
     inlier_count: int
     references: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., inlier_count: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ...) -> None: ...
+    covariance: PoseCovariance
+    accuracy: Accuracy
+    arbitrary_unit: bool
+    in_axes: FramedPose
+    geo_pose: GeoPose
+    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., inlier_count: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., arbitrary_unit: bool = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ...) -> None: ...
 
 class Diagnostics(_message.Message):
     __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "attempts", "stationary_keypoint_count")

@@ -50,7 +50,7 @@ class Verdicts:
         """The result, rejected if its pose is beyond hard limits, or its references contradict one another."""
         outcome, narrowing = found.answer.outcome, search.query.narrowing
         if not isinstance(outcome, Localization):
-            return found
+            return self._without_imprecise(search, found)
         if narrowing is not ANYWHERE:
             beyond = narrowing.contradiction(outcome.world_from_camera, search.attributes.unit)
             if beyond:
@@ -61,6 +61,16 @@ class Verdicts:
             if disagreement:
                 return _rejected(found, disagreement, Doubt.CHANCE)
         return found
+
+    def _without_imprecise(self, search: Search, found: Found) -> Found:
+        """The rejection without its pose, if that is beyond hard limits, or the scene contradicts itself."""
+        outcome = found.answer.outcome
+        if not isinstance(outcome, Rejection) or outcome.imprecise is None:
+            return found
+        pose, unit = outcome.imprecise.world_from_camera, search.attributes.unit
+        if not search.attributes.contradiction and not search.query.narrowing.contradiction(pose, unit):
+            return found
+        return replace(found, answer=replace(found.answer, outcome=replace(outcome, imprecise=None)))
 
     def answer(self, search: Search) -> Result:
         """The result for the caller by the verdict."""

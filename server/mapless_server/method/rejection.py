@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import Enum
 
-from mapless.geometry import RigidTransform
+from mapless.geometry import Array, RigidTransform
 
 
 class RejectionReason(str, Enum):
@@ -104,17 +104,19 @@ class Hint:
 
 @dataclass(frozen=True, eq=False)
 class PoseHypothesis:
-    """One of several poses that explain the photograph.
+    """A pose that explains the photograph, and is not accepted.
 
     Attributes:
         world_from_camera: metric.
         inlier_count: keypoints of the photograph with an inlier match with any reference.
-        references: names of the references that support this hypothesis more than the other.
+        references: names of the references that support it; of one of two hypotheses, more than the other.
+        covariance: (6, 6) as of `Localization`, of a pose that is only too uncertain; None for one of two.
     """
 
     world_from_camera: RigidTransform
     inlier_count: int
     references: tuple[str, ...]
+    covariance: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,7 @@ class Rejection:
         tried: number of 2D-3D matches that were used; None if there are none yet.
         intrinsics_checks: what the matches say of the intrinsics; empty unless a conflict with them is the reason.
         hypotheses: the poses that explain it, the better supported first; empty unless AMBIGUOUS.
+        imprecise: the pose that is rejected for its radius alone, with covariance; None if there is more against it.
     """
 
     reason: RejectionReason
@@ -136,3 +139,4 @@ class Rejection:
     hypotheses: tuple[PoseHypothesis, ...] = ()
     tried: int | None = None
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
+    imprecise: PoseHypothesis | None = None

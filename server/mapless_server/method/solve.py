@@ -143,12 +143,15 @@ def _from_lines(coarse: Coarse) -> Answer:
     with prepared.context.stage("judge"):
         evidence = two_view_evidence(without_unmoved(support, prepared.pipeline.matcher.pairs.stationary))
         doubt, trust = two_view_failure(evidence), two_view_trust(evidence)
-        rejection = None if doubt else contradiction(support, votes_of(support), prepared.unit)
+        is_doubted, covariance = trust < 1 - prepared.options.coverage, support.estimate.covariance
+        rejection = (
+            contradiction(support, votes_of(support), prepared.unit, covariance, is_doubted) if not doubt else None
+        )
     if rejection:
         return coarse.answer(rejection, support)
     if doubt and lacks_distance(evidence):
         return coarse.answer(one_reference_rejection(doubt, support))
-    if doubt or trust < 1 - prepared.options.coverage:
+    if doubt or is_doubted:
         message = doubt or f"the trust of the pose from epipolar lines is {trust:.3f}"
         return coarse.answer(Rejection(RejectionReason.TOO_FEW_MATCHES, message))
     return coarse.answer(Localization.of(support.estimate, trust, support.two_view), support)

@@ -27,7 +27,7 @@ import numpy as np
 from mapless.geometry import Array
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR
 from mapless_server.method.bundle.estimate import error_radii
-from mapless_server.services.messages.answers import Factors
+from mapless_server.services.messages.radii import Factors
 
 LEVELS = np.concatenate([[0.005], np.arange(1, 100) / 100, [0.995, 0.999]])
 """Probabilities for which radii are known; between them they are interpolated."""

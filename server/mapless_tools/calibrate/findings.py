@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import betaincinv
 
-from mapless_server.services.messages.answers import Conditions, Factors
+from mapless_server.services.messages.radii import Conditions, Factors
 
 from .claims import Claim, Sample, TooFewQueries, fit_factors, left_one_out
 from .queries import Outcome

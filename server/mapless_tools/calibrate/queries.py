@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapless import Client, InvalidArgument, LocalizationResult, Reference, Rejected, RigidTransform
-from mapless_server.services.messages.answers import Conditions
+from mapless_server.services.messages.radii import Conditions
 from mapless_tools.child import CONNECT
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error

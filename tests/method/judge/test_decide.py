@@ -205,6 +205,45 @@ class TestDecide:
         assert (verdict.chosen, verdict.doubts) == (mirrored, Doubt.CAMERA)
 
 
+def imprecise(x_m: float = 0.0, inliers: int = 100) -> Answer:
+    """Of a pose that its radius alone speaks against."""
+    given = PoseHypothesis(pose(x_m), inliers, ("near",), np.eye(6))
+    return posed(rejected(RejectionReason.GATE, imprecise=given), x_m, inliers)
+
+
+class TestImprecise:
+    def test_such_a_rejection_is_preferred_to_those_without_a_pose(self) -> None:
+        outcome = decide([found(imprecise()), found(rejected(), STRONGER)], NONE).outcome
+        assert isinstance(outcome, Rejection)
+        assert outcome.reason is RejectionReason.GATE
+        assert outcome.imprecise is not None
+
+    def test_of_one_place_the_best_pose_is_offered(self) -> None:
+        worse, better = found(imprecise(0.0, 60)), found(imprecise(0.01, 90), FIRST.but(matching=Matching.WIDE))
+        assert decide([worse, better], NONE).chosen is better
+
+    @pytest.mark.parametrize(("inliers", "is_offered"), [(60, True), (70, False)])
+    def test_another_place_that_could_be_it_forbids_it(self, inliers: int, is_offered: bool) -> None:
+        other = found(posed(rejected(RejectionReason.GATE), 5.0, inliers), FIRST.but(matching=Matching.WIDE))
+        outcome = decide([found(imprecise()), other], NONE).outcome
+        assert isinstance(outcome, Rejection)
+        assert (outcome.imprecise is not None) is is_offered
+
+    @pytest.mark.parametrize(("x_m", "is_offered"), [(0.0, True), (30.0, False)])
+    def test_a_prior_that_it_contradicts_forbids_it(self, x_m: float, is_offered: bool) -> None:
+        outcome = decide([found(imprecise(x_m))], AT_ORIGIN).outcome
+        assert isinstance(outcome, Rejection)
+        assert (outcome.imprecise is not None) is is_offered
+
+    def test_a_named_cause_is_said_instead(self) -> None:
+        check = IntrinsicsCheck(IntrinsicsParameter.FOCAL_LENGTH, 525.0, 541.0, 2.0, 1.6, conflict=True, used=True)
+        wrong = found(posed(rejected(RejectionReason.GATE, intrinsics_checks=(check,)), 0.0), STRONGER)
+        outcome = decide([found(imprecise()), wrong], NONE).outcome
+        assert isinstance(outcome, Rejection)
+        assert outcome.intrinsics_checks
+        assert outcome.imprecise is None
+
+
 class TestPriors:
     def test_they_decide_between_places_that_scores_do_not(self) -> None:
         both = [found(accepted(30.0, 149)), found(accepted(0.0, 100), STRONGER)]

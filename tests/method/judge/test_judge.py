@@ -134,6 +134,19 @@ def test_a_radius_of_too_many_wrong_poses_is_rejected(share: float, is_accepted:
         assert rejection.reason is RejectionReason.GATE
         assert rejection.hint
         assert rejection.hint.best_reference
+        assert rejection.imprecise is not None
+        assert rejection.imprecise.world_from_camera is support.estimate.world_from_camera
+
+
+def test_a_pose_with_too_little_evidence_is_not_only_imprecise() -> None:
+    support = support_of()
+    wide = replace(support, estimate=replace(support.estimate, covariance=support.distance_m() ** 2 * np.eye(6)))
+    trust, rejection = verdict(wide, 1.0)
+    assert rejection is not None
+    assert rejection.imprecise is not None
+    doubted = verdict(wide, 1 - trust - 1e-6)[1]
+    assert doubted is not None
+    assert (doubted.message, doubted.imprecise) == (rejection.message, None)
 
 
 def test_worse_matches_and_fewer_points_lower_the_trust() -> None:

@@ -108,9 +108,12 @@ def shifted(answer: Answer, offset: Array) -> Answer:
     outcome, scale = answer.outcome, answer.scale
     if isinstance(outcome, Localization):
         outcome = replace(outcome, world_from_camera=outcome.world_from_camera.shifted(offset))
-    elif outcome.hypotheses:
+    else:
         moved = [replace(it, world_from_camera=it.world_from_camera.shifted(offset)) for it in outcome.hypotheses]
-        outcome = replace(outcome, hypotheses=tuple(moved))
+        imprecise = outcome.imprecise
+        if imprecise is not None:
+            imprecise = replace(imprecise, world_from_camera=imprecise.world_from_camera.shifted(offset))
+        outcome = replace(outcome, hypotheses=tuple(moved), imprecise=imprecise)
     if scale:
         world_from_local = replace(scale.world_from_local, translation=scale.world_from_local.translation + offset)
         scale = replace(

@@ -107,7 +107,7 @@ def decide(found: Sequence[Found], priors: Priors, unit: str = "m", options: Pla
         return Verdict(wrong[0], wrong[0].answer.outcome, Doubt.CAMERA)
     within = [it for it in found if isinstance(it, Hypothesis) and Doubt.BEYOND_LIMITS not in it.doubts]
     if not any(it.is_accepted for it in within):
-        return _rejected(found, priors, options)
+        return _rejected(found, within, priors, options)
     rivals = _rivals(_places_of(within, found, options), priors, options)
     if len(rivals) == 1:
         return _at(rivals[0])
@@ -252,8 +252,11 @@ def _at(place: _Place) -> Verdict:
     return Verdict(chosen, chosen.answer.outcome, reduce(and_, (it.doubts for it in counted)))
 
 
-def _rejected(found: Sequence[Found], priors: Priors, options: PlaceOptions) -> Verdict:
-    """The rejection that says most, with all doubts: the strongest features' first, unless one names a cause."""
+def _rejected(found: Sequence[Found], within: Sequence[Hypothesis], priors: Priors, options: PlaceOptions) -> Verdict:
+    """The rejection that says most, with all doubts: the strongest features' first, unless one names a cause.
+
+    After those with a cause comes that of a pose that only its radius speaks against.
+    """
 
     def says(result: Found) -> tuple[bool, int, bool]:
         outcome = result.answer.outcome
@@ -261,9 +264,13 @@ def _rejected(found: Sequence[Found], priors: Priors, options: PlaceOptions) -> 
         names_two = bool(outcome.hypotheses) or Doubt.CAMERA in result.doubts
         return names_two, result.attempt.features, outcome.hint is not None
 
-    chosen = max(found, key=says)
+    chosen, imprecise = max(found, key=says), _imprecise(within, found, priors, options)
+    if imprecise is not None and not says(chosen)[0]:
+        chosen = imprecise
     outcome, doubts = chosen.answer.outcome, reduce(or_, (it.doubts for it in found))
     assert isinstance(outcome, Rejection)
+    if chosen is not imprecise:
+        outcome = replace(outcome, imprecise=None)
     verdict = Verdict(chosen, outcome, Doubt.CAMERA if Doubt.CAMERA in chosen.doubts else doubts)
     if len(outcome.hypotheses) != 2 or outcome.hint is not None:
         return verdict
@@ -272,6 +279,19 @@ def _rejected(found: Sequence[Found], priors: Priors, options: PlaceOptions) -> 
     if isinstance(decided, Hint):
         return replace(verdict, outcome=replace(outcome, hint=decided))
     return verdict if decided is None else replace(verdict, place=outcome.hypotheses[decided])
+
+
+def _imprecise(
+    within: Sequence[Hypothesis], found: Sequence[Found], priors: Priors, options: PlaceOptions
+) -> Hypothesis | None:
+    """The pose that would be answered but for its radius; None without one, or if a place or a prior contradicts it."""
+    offered = [it for it in within if isinstance(it.answer.outcome, Rejection) and it.answer.outcome.imprecise]
+    if not offered:
+        return None
+    place, *others = _rivals(_places_of(within, found, options), priors, options)
+    if others or _conflicts(place, priors):
+        return None
+    return next((it for it in place.poses if it in offered), None)
 
 
 def _ambiguous(rivals: Sequence[_Place], hint: Hint | None, unit: str) -> Verdict:

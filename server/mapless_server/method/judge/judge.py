@@ -31,9 +31,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
+from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 
-from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance
+from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance, with_halves
 from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.one_reference import Found
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
@@ -131,14 +131,18 @@ def judge(
     evidence = evidence_of(support, votes)
     trust = trust_of(evidence, options, log10_chance)
     doubt = low_trust(evidence, trust, coverage)
-    contradicted = contradiction(support, votes, unit, is_doubted=doubt is not None)
+    estimate = with_halves(support.estimate, evidence.disagreement * support.distance_m())
+    contradicted = contradiction(support, votes, unit, estimate.covariance, is_doubted=doubt is not None)
     return Judgement(trust, evidence, contradicted or doubt)
 
 
-def contradiction(support: PosedSupport, votes: Votes, unit: str, is_doubted: bool = False) -> Rejection | None:
+def contradiction(
+    support: PosedSupport, votes: Votes, unit: str, covariance: Array, is_doubted: bool = False
+) -> Rejection | None:
     """Rejects a pose whose references, intrinsics or other matches contradict it, or whose radius is too large.
 
-    For one that is doubted for lack of evidence see `wrong_camera`.
+    The latter has the pose, with the covariance (6, 6) that it would be answered with, unless it is doubted for lack of
+    evidence, too; for such a one see also `wrong_camera`.
     """
     if disagreeing := disagreeing_references([supporters_of(support)]):
         return disagreeing
@@ -150,7 +154,12 @@ def contradiction(support: PosedSupport, votes: Votes, unit: str, is_doubted: bo
     if wrong := wrong_camera(support, best, is_doubted):
         return wrong
     hypotheses = find_rival(support, votes)
-    return _ambiguous(hypotheses, unit) if hypotheses else _too_uncertain(support)
+    if hypotheses:
+        return _ambiguous(hypotheses, unit)
+    rejection = _too_uncertain(support)
+    return (
+        rejection if rejection is None or is_doubted else replace(rejection, imprecise=_imprecise(support, covariance))
+    )
 
 
 def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.0) -> float:
@@ -220,6 +229,12 @@ def _too_uncertain(support: PosedSupport) -> Rejection | None:
     names = [support.references[i].name for i in strongest]
     advice = f"Add references that show the same from other places: {' and '.join(names)} alone do not suffice."
     return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.ADD_REFERENCES, advice, names[0]))
+
+
+def _imprecise(support: PosedSupport, covariance: Array) -> PoseHypothesis:
+    counts = np.array(support.inliers_by_reference())
+    names = tuple(support.references[i].name for i in np.argsort(-counts, kind="stable") if counts[i])
+    return PoseHypothesis(support.estimate.world_from_camera, support.inlier_count(), names, covariance)
 
 
 def _ambiguous(hypotheses: tuple[PoseHypothesis, PoseHypothesis], unit: str) -> Rejection:

@@ -1,187 +1,75 @@
 """Messages of an answer: localization with its calibrated radii, or rejection; frames, and diagnostics."""
 
-import math
-import sys
-from dataclasses import asdict, astuple, dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from mapless import wire
 from mapless.axes import Axes, covariance_to, pose_to, world_from_session_in
 from mapless.geodesy import Datum, geopose
 from mapless.geometry import Array, RigidTransform
-from mapless.scenes import FACTORS, MAX_FACTOR, MIN_FACTOR, Calibration
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
 from mapless_server.engine.query import Result
-from mapless_server.method.bundle.estimate import (
-    TAIL_95,
-    Accuracy,
-    PosedSupport,
-    accuracy_from_covariance,
-    growth,
-    self_tail,
-    viewpoint_gap,
-)
+from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance, viewpoint_gap
 from mapless_server.method.bundle.priors import PriorCheck
 from mapless_server.method.judge.answer import Localization
-from mapless_server.method.options import LocalizeOptions, Variant
-from mapless_server.method.rejection import Hint, IntrinsicsCheck, Rejection
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.rejection import Hint, IntrinsicsCheck, PoseHypothesis, Rejection
 from mapless_server.method.structure.model import MetricScale
-from mapless_server.store import SceneAttributes, SelfCalibration
+from mapless_server.store import SceneAttributes
 
 from .queries import enum_from_message, enum_to_message
-
-_SELF_CALIBRATED = Variant.BEST.name
-"""The variant by which references are localized against the others."""
-
-
-@dataclass(frozen=True)
-class Factors:
-    """Factors of the radii of an answer's position and rotation; 1 leaves them as they are."""
-
-    position_68: float = 1.0
-    position_95: float = 1.0
-    rotation_68: float = 1.0
-    rotation_95: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not (math.isfinite(value) and MIN_FACTOR <= value <= MAX_FACTOR):
-                raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {value:g}")
-
-    @classmethod
-    def of(cls, calibration: Calibration) -> "Factors":
-        """The factors of a scene's calibration."""
-        return cls(*(getattr(calibration, name) for name in FACTORS))
-
-    @classmethod
-    def of_references(cls, calibration: SelfCalibration, accuracy: Accuracy, gap: float) -> "Factors":
-        """Factors of a self-calibration for an answer with these radii at a gap, see `scenes.calibration.fit`."""
-        own, grown = calibration, growth(gap)
-        position = _factor(grown * own.position_factor, own.reference_noise_m, accuracy.position_68_m)
-        rotation = _factor(grown * own.rotation_factor, own.reference_noise_deg, accuracy.rotation_68_deg)
-        tail = self_tail(own.answer_count) / TAIL_95
-        return cls(position, max(MIN_FACTOR, position * tail), rotation, max(MIN_FACTOR, rotation * tail))
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """What computed an answer; factors hold only for answers of the same conditions.
-
-    The name of the features contains their options, "sift-2048-1024px-0.02"; the variant is named as by `Diagnostics`,
-    "BEST". Another version of the server may report other radii.
-    """
-
-    features: str
-    backend: str
-    variant: str
-    server_version: str
-
-
-@dataclass(frozen=True, eq=False)
-class ReportedRadii:
-    """The reported uncertainty of an answer.
-
-    Attributes:
-        accuracy: the radii.
-        covariance: (6, 6), order x y z rx ry rz, metres and radians.
-        calibration: origin of the factors: "GENERIC" (no factors), "SELF" or "MEASURED".
-        count: number of references that were localized against the others, or of photographs that were measured.
-    """
-
-    accuracy: Accuracy
-    covariance: Array
-    calibration: str = "GENERIC"
-    count: int = 0
-
-
-def reported_radii(
-    accuracy: Accuracy,
-    covariance: Array,
-    conditions: Conditions,
-    kind: str,
-    attributes: SceneAttributes,
-    gap: float | None,
-) -> ReportedRadii:
-    """Radii by the scene's measured calibration, else by its self-calibration, if made under the same conditions.
-
-    Args:
-        accuracy: radii of the method.
-        covariance: (6, 6) of the method.
-        conditions: what computed the answer.
-        kind: kind of the answer, see `store.calibration_kind`; with depths kept with references another one.
-        attributes: attributes of the scene.
-        gap: gap of the answer, see `method.bundle.estimate.viewpoint_gap`; None if unknown.
-    """
-    measured = attributes.calibration
-    if measured is not None and measured.is_of(*astuple(conditions)):
-        factors, calibration, count = Factors.of(measured), "MEASURED", measured.query_count
-    else:
-        own = attributes.self_calibration(kind)
-        if own is None or not own.answer_count or conditions.variant != _SELF_CALIBRATED or gap is None:
-            return ReportedRadii(accuracy, covariance)
-        factors, calibration, count = Factors.of_references(own, accuracy, gap), "SELF", own.answer_count
-    return ReportedRadii(scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors), calibration, count)
-
-
-def _factor(factor: float, noise: float, radius: float) -> float:
-    """Ratio by which a radius grows if a factor multiplies it and a constant noise is added."""
-    return min(max(math.hypot(factor, noise / max(radius, sys.float_info.min)), MIN_FACTOR), MAX_FACTOR)
-
-
-def scaled_accuracy(accuracy: Accuracy, factors: Factors) -> Accuracy:
-    """Multiplies radii by factors; the 95 % radius is never smaller than the 68 % radius."""
-    position_68_m = factors.position_68 * accuracy.position_68_m
-    rotation_68_deg = factors.rotation_68 * accuracy.rotation_68_deg
-    return replace(
-        accuracy,
-        position_68_m=position_68_m,
-        position_95_m=max(position_68_m, factors.position_95 * accuracy.position_95_m),
-        rotation_68_deg=rotation_68_deg,
-        rotation_95_deg=max(rotation_68_deg, factors.rotation_95 * accuracy.rotation_95_deg),
-    )
-
-
-def scaled_covariance(covariance: Array, factors: Factors) -> Array:
-    """The covariance (6, 6) whose 68 % radii are those of the given one times the factors.
-
-    C -> D C D with D = diag(fp, fp, fp, fr, fr, fr): positions by fp^2, rotations by fr^2, their covariances by fp fr,
-    so that it stays positive semi-definite and all correlations are kept.
-    """
-    scale = np.repeat([factors.position_68, factors.rotation_68], 3)
-    return np.asarray(scale[:, None] * covariance * scale, float)
+from .radii import Conditions, ReportedRadii, reported_radii
 
 
 @dataclass(frozen=True, eq=False)
 class AnswerFrames:
-    """The frames in which a caller requests its answer, besides OpenCV's: the axes of its camera.
+    """The form in which a caller requests its answer.
 
-    `session_from_camera` is the device's pose at the time of capture, in these axes; None if the request has none.
+    Attributes:
+        axes: of its camera, besides OpenCV's.
+        session_from_camera: the device's pose at the time of capture, in these axes; None if the request has none.
+        includes_imprecise: whether a pose that is rejected for its radius alone goes with the rejection.
     """
 
     axes: Axes
     session_from_camera: RigidTransform | None
+    includes_imprecise: bool = False
 
 
 def answer_frames_of(request: pb.LocalizeRequest) -> AnswerFrames:
     """Returns the frames of a request; FieldError names the wrong field."""
-    return AnswerFrames(axes_from_message(request.options), session_from_message(request))
+    options = request.options
+    return AnswerFrames(axes_from_message(options), session_from_message(request), options.include_imprecise_pose)
 
 
 def outcome_to_message(result: Result, options: LocalizeOptions, frames: AnswerFrames) -> pb.LocalizeResponse:
     """Makes the response, with the outcome only."""
     outcome = result.answer.outcome
     if isinstance(outcome, Rejection):
-        return pb.LocalizeResponse(rejection=rejection_to_message(outcome))
-    radii = None
-    if outcome.covariance is not None:
-        accuracy = accuracy_from_covariance(outcome.covariance)
-        conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
-        support = result.answer.support
-        gap = viewpoint_gap(support)[0] if isinstance(support, PosedSupport) else None
-        radii = reported_radii(accuracy, outcome.covariance, conditions, result.tier.kind, result.attributes, gap)
+        return pb.LocalizeResponse(rejection=result_to_rejection(result, options, frames))
+    radii = None if outcome.covariance is None else _radii_of(result, options, outcome.covariance)
     return pb.LocalizeResponse(localization=_localization_to_message(outcome, radii, result.attributes, frames))
+
+
+def result_to_rejection(result: Result, options: LocalizeOptions, frames: AnswerFrames) -> pb.Rejection:
+    """Message of the rejection that a result is, with the pose that is rejected for its radius alone, if requested."""
+    rejection = result.answer.outcome
+    assert isinstance(rejection, Rejection)
+    message, pose = rejection_to_message(rejection), rejection.imprecise
+    if pose is not None and pose.covariance is not None and frames.includes_imprecise:
+        offered, radii = _hypothesis_to_message(pose), _radii_of(result, options, pose.covariance)
+        offered.arbitrary_unit = result.attributes.arbitrary_unit
+        _set_radii(offered, pose.world_from_camera, radii, result.attributes, frames)
+        message.hypotheses.append(offered)
+    return message
+
+
+def _radii_of(result: Result, options: LocalizeOptions, covariance: Array) -> ReportedRadii:
+    """The reported radii of the pose of a result, by its covariance (6, 6)."""
+    accuracy, support = accuracy_from_covariance(covariance), result.answer.support
+    conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
+    gap = viewpoint_gap(support)[0] if isinstance(support, PosedSupport) else None
+    return reported_radii(accuracy, covariance, conditions, result.tier.kind, result.attributes, gap)
 
 
 def _localization_to_message(
@@ -198,19 +86,24 @@ def _localization_to_message(
         scale_source=enum_to_message(localization.scale_source, pb.ScaleSource),
         intrinsics_checks=[_intrinsics_check_to_message(check) for check in localization.intrinsics_checks],
     )
+    _set_radii(message, localization.world_from_camera, radii, attributes, frames)
+    message.arbitrary_unit = attributes.arbitrary_unit
+    return message
+
+
+def _set_radii(
+    message: pb.Localization | pb.Hypothesis,
+    world_from_camera: RigidTransform,
+    radii: ReportedRadii | None,
+    attributes: SceneAttributes,
+    frames: AnswerFrames,
+) -> None:
+    """Sets the radii of a pose, and the pose in the caller's frames."""
     if radii is not None:
         message.covariance.CopyFrom(covariance_to_message(radii.covariance))
         message.accuracy.CopyFrom(accuracy_to_message(radii))
-    set_frames(
-        message,
-        localization.world_from_camera,
-        radii.covariance if radii else None,
-        frames.axes,
-        frames.session_from_camera,
-        attributes.datum,
-    )
-    message.arbitrary_unit = attributes.arbitrary_unit
-    return message
+    covariance = radii.covariance if radii else None
+    set_frames(message, world_from_camera, covariance, frames.axes, frames.session_from_camera, attributes.datum)
 
 
 def covariance_to_message(covariance: Array) -> pb.PoseCovariance:
@@ -250,20 +143,21 @@ def check_to_message(check: PriorCheck) -> pb.PriorCheck:
 
 
 def rejection_to_message(rejection: Rejection) -> pb.Rejection:
-    """Message of a rejection."""
+    """Message of a rejection, without a pose that is rejected for its radius alone."""
     return pb.Rejection(
         reason=enum_to_message(rejection.reason, pb.RejectionReason),
         message=rejection.message,
         hint=_hint_to_message(rejection.hint) if rejection.hint else None,
-        hypotheses=[
-            pb.Hypothesis(
-                world_from_camera=wire.transform_to_message(it.world_from_camera),
-                inlier_count=it.inlier_count,
-                references=it.references,
-            )
-            for it in rejection.hypotheses
-        ],
+        hypotheses=[_hypothesis_to_message(it) for it in rejection.hypotheses],
         intrinsics_checks=[_intrinsics_check_to_message(check) for check in rejection.intrinsics_checks],
+    )
+
+
+def _hypothesis_to_message(hypothesis: PoseHypothesis) -> pb.Hypothesis:
+    return pb.Hypothesis(
+        world_from_camera=wire.transform_to_message(hypothesis.world_from_camera),
+        inlier_count=hypothesis.inlier_count,
+        references=hypothesis.references,
     )
 
 
@@ -356,7 +250,7 @@ def session_from_message(request: pb.LocalizeRequest) -> RigidTransform | None:
 
 
 def set_frames(
-    message: pb.Localization,
+    message: pb.Localization | pb.Hypothesis,
     world_from_camera: RigidTransform,
     covariance: Array | None,
     axes: Axes,

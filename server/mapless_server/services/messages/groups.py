@@ -23,7 +23,7 @@ from mapless_server.store import SceneAttributes
 
 from .answers import (
     MAX_SESSION_COORDINATE_M,
-    ReportedRadii,
+    AnswerFrames,
     accuracy_to_message,
     axes_from_message,
     check_to_message,
@@ -31,6 +31,7 @@ from .answers import (
     diagnostics_to_message,
     geo_pose_to_message,
     rejection_to_message,
+    result_to_rejection,
 )
 from .queries import (
     MAX_CANDIDATES,
@@ -43,6 +44,7 @@ from .queries import (
     reference_count_from_message,
     reference_ids_from_names,
 )
+from .radii import ReportedRadii
 
 if TYPE_CHECKING:
     from mapless_server.engine.groups import GroupResult
@@ -169,7 +171,8 @@ def rig_to_message(
         if attributes.datum is not None:
             message.geo_pose.CopyFrom(geo_pose_to_message(outcome.world_from_rig, attributes.datum))
         response = pb.LocalizeRigResponse(localization=message)
-    response.images.extend(_reports(outcome, group, queries))
+    frames = AnswerFrames(Axes.OPENCV, None, request.options.include_imprecise_pose)
+    response.images.extend(_reports(outcome, group, queries, [frames] * len(queries)))
     for echoed in ("capture_time", "session_from_rig"):
         if request.HasField(echoed):
             getattr(response, echoed).CopyFrom(getattr(request, echoed))
@@ -203,7 +206,10 @@ def sequence_to_message(
                 captured.capture_time.CopyFrom(frame.capture_time)
         _set_support(message, outcome.matched, outcome.covariances[-1])
         response = pb.LocalizeSequenceResponse(localization=message)
-    response.images.extend(_reports(outcome, group, queries))
+    includes = request.options.include_imprecise_pose
+    sessions = poses_from_message(request.frames, "frames", "session_from_camera")
+    frames = [AnswerFrames(axes, session, includes) for session in sessions]
+    response.images.extend(_reports(outcome, group, queries, frames))
     return response
 
 
@@ -227,7 +233,10 @@ def _set_support(
 
 
 def _reports(
-    outcome: RigEstimate | SequenceEstimate | Rejection, group: GroupResult, queries: Sequence[Query]
+    outcome: RigEstimate | SequenceEstimate | Rejection,
+    group: GroupResult,
+    queries: Sequence[Query],
+    frames: Sequence[AnswerFrames],
 ) -> list[pb.ImageReport]:
     matched = {} if isinstance(outcome, Rejection) else {it.source.image: it for it in outcome.matched}
     checks = {} if isinstance(outcome, Rejection) else outcome.prior_checks
@@ -239,7 +248,7 @@ def _reports(
         report.diagnostics.total_duration.FromNanoseconds(round(1e9 * group.seconds[i]))
         report.diagnostics.processor_duration.FromNanoseconds(round(1e9 * group.processor_s[i]))
         if isinstance(alone.outcome, Rejection):
-            report.alone.CopyFrom(rejection_to_message(alone.outcome))
+            report.alone.CopyFrom(result_to_rejection(result, query.options, frames[i]))
         report.prior_checks.extend(map(check_to_message, checks.get(i, ())))
         if i in matched:
             report.inlier_count = int(matched[i].inliers.sum())
