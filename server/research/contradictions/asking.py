@@ -35,9 +35,9 @@ def ask_all(cases: Iterable[Case]) -> Iterator[Row]:
     with _server() as (server, client):
         for case in cases:
             if case.place.scene not in stored:
-                _store(client, case.place)
+                store(client, case.place)
                 stored.add(case.place.scene)
-            yield _ask(server, client, case)
+            yield ask(server, client, case)
 
 
 @contextmanager
@@ -50,29 +50,31 @@ def _server() -> Iterator[tuple[ChildServer, Client]]:
         yield server, client
 
 
-def _store(client: Client, place: Place) -> None:
+def store(client: Client, place: Place) -> None:
+    """Stores a place's references in a new scene; MaplessError if that fails."""
     client.create_scene(place.scene, arbitrary_unit=not place.dataset.metric)
     client.add_references(place.scene, place.references())
 
 
-def _ask(server: ChildServer, client: Client, case: Case) -> Row:
-    """A case's answer as JSON has it; a call that fails is an outcome, too."""
+def ask(server: ChildServer, client: Client, case: Case) -> Row:
+    """A case's answer as JSON has it; a call that fails is an outcome, too. Its place must be stored."""
     row: Row = {"kind": case.kind, "name": case.name, "expected": case.expected.value}
     image = case.image()
-    begin_cpu_s, begin_s = _processor_s(server), time.perf_counter()
+    begin_cpu_s, begin_s = processor_s(server), time.perf_counter()
     try:
         answer = client.localize(image, case.camera, case.place.scene, priors=case.priors, include_debug=True)
     except MaplessError as error:
         return row | {"outcome": f"failed: {type(error).__name__}", "message": str(error)}
     finally:
         row["seconds"] = time.perf_counter() - begin_s
-        row["processor_s"] = _processor_s(server) - begin_cpu_s
+        row["processor_s"] = processor_s(server) - begin_cpu_s
     row |= _of_rejection(answer) if isinstance(answer, Rejected) else _of_localization(case, answer)
     diagnostics = answer.diagnostics
     return row | {
         "features": diagnostics.features,
         "retrieval": diagnostics.retrieval,
         "attempts": [asdict(it) for it in getattr(diagnostics, "attempts", ())],
+        "references": [asdict(it) for it in diagnostics.references],
     }
 
 
@@ -141,6 +143,6 @@ def _numbers(pose: RigidTransform) -> list[float]:
     return [*pose.translation.tolist(), q.x, q.y, q.z, q.w]
 
 
-def _processor_s(server: ChildServer) -> float:
+def processor_s(server: ChildServer) -> float:
     """Processor time of the server's process, by the clock that clock_getcpuclockid defines on Linux."""
     return time.clock_gettime((~server.process_id << 3) | 2)

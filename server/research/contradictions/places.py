@@ -85,7 +85,8 @@ def place_reader(data: Path) -> PlaceOf:
     def place_of(folder: str, count: int, copy_stride: int = 0) -> Place:
         dataset = dataset_of(folder)
         copies = {0: "", 1: "-twice"}.get(copy_stride, f"-and-every-{copy_stride}")
-        return Place(f"{SHORT[folder]}-{count}{copies}", dataset, tuple(spread(dataset.frames, count)), copy_stride)
+        name = SHORT.get(folder, folder.replace("/", "-"))
+        return Place(f"{name}-{count}{copies}", dataset, tuple(spread(dataset.frames, count)), copy_stride)
 
     return place_of
 

@@ -1,0 +1,96 @@
+"""Asks the photographs, and prints what they cost and which of them are answered; see the package."""
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from mapless_tools.output_files import check_writable, markdown_table, write_json
+from research.contradictions.asking import Row
+from research.contradictions.places import place_reader
+
+from .cases import EXPENSIVE_S, LIST, candidates, doubtful, other_places, turned_photographs, write_list
+from .in_process import accepted
+from .serving import answers
+from .tables import by, by_angle
+
+WHAT = ("other-place", "doubtful", "turned")
+
+
+def main() -> None:
+    """Asks and prints; a folder or file that is wrong ends the program with exit code 2."""
+    parser = argparse.ArgumentParser(prog="python -m research.doubt", description=__doc__)
+    parser.add_argument("what", choices=WHAT)
+    parser.add_argument("scenes", type=Path, nargs="?", help="folder of the scenes' folders")
+    parser.add_argument("--json", type=Path, required=True, help="file for the answers")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="every N-th photograph; default: all")
+    parser.add_argument("--store", type=Path, help="folder of a store that remains, for later runs")
+    parser.add_argument("--list", action="store_true", help=f"doubtful: ask all candidates, and write {LIST.name}")
+    parser.add_argument("--in-process", action="store_true", help="other-place: 2,000 queries without a server")
+    parser.add_argument("--print", action="store_true", help="print the table of an existing file, and ask nothing")
+    arguments = parser.parse_args()
+    if arguments.every < 1:
+        parser.error(f"--every must be at least 1, is {arguments.every}")
+    if not arguments.print and arguments.scenes is None:
+        parser.error("give SCENES")
+    try:
+        if arguments.print:
+            print("\n".join(table(arguments.what, json.loads(arguments.json.read_text())["answers"])))
+            return
+        check_writable(arguments.json)
+        measure(arguments)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
+
+
+def measure(arguments: argparse.Namespace) -> None:
+    """Asks what the arguments say."""
+    if arguments.what == "other-place" and arguments.in_process:
+        rows = ask(accepted(arguments.scenes), arguments.json)
+        print("\n".join(markdown_table("outcome | queries", Counter(it["outcome"] for it in rows).most_common())))
+        return
+    of = place_reader(arguments.scenes)
+    kinds = {"other-place": other_places, "doubtful": doubtful, "turned": turned_photographs}
+    asked = list(candidates(of) if arguments.list else kinds[arguments.what](of))
+    if arguments.what == "turned":
+        # Whole photographs: one that is asked, is asked at every angle.
+        angles = len({it.fields["angle_deg"] for it in asked})
+        asked = [it for i, it in enumerate(asked) if i // angles % arguments.every == 0]
+    else:
+        asked = asked[:: arguments.every]
+    rows = ask(answers(asked, arguments.store), arguments.json, len(asked))
+    if arguments.list:
+        write_list(rows)
+        rows = [it for it in rows if it["processor_s"] > EXPENSIVE_S]
+    print("\n".join(table(arguments.what, rows)))
+
+
+def ask(answered: Iterable[Row], file: Path, count: int | None = None) -> Sequence[Row]:
+    """Collects the rows; the file is written after each, since a run takes minutes."""
+    begin_s, rows = time.perf_counter(), list[Row]()
+    for row in answered:
+        rows.append(row)
+        if count is None:
+            continue
+        line = f"{len(rows)}/{count} {row['name']}: {row['outcome']}, {row['processor_s']:.1f} s"
+        print(line, file=sys.stderr, flush=True)
+        write_json(file, {"answers": rows})
+    write_json(file, {"answers": rows})
+    print(f"{time.perf_counter() - begin_s:.0f} s", file=sys.stderr)
+    return rows
+
+
+def table(what: str, rows: Sequence[Row]) -> list[str]:
+    """The table of a file of answers."""
+    if what == "turned":
+        return by_angle(rows)
+    if what == "doubtful":
+        return by("references", lambda row: row["references_stored"], rows)
+    return by("asked", lambda row: "in other places", rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""What `research.doubt` asks and sums up: turned rasters, crossed places, the list, and its tables."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from mapless import Camera, RadialTangential, RigidTransform
+from mapless.geometry import rotation_from_vector
+from mapless_tools.output_files import write_json
+from research.contradictions.cases import quarter_turn
+from research.contradictions.places import place_reader
+from research.doubt.cases import doubtful, write_list
+from research.doubt.scenes import FOLDERS, PLACES, crossed
+from research.doubt.tables import by, by_angle
+from research.doubt.turning import turned, turned_pixels
+
+LENS = RadialTangential(-0.1, 0.02, 0.001, -0.002)
+CAMERA = Camera(160, 120, 150.0, 160.0, 76.0, 63.0, LENS)
+POSE = RigidTransform(rotation_from_vector([0.1, 0.2, 0.3]), np.array([0.1, 0.0, 0.2]))
+X_IN_WORLD = POSE.apply([[0.6, -0.4, 3.0], [-0.9, 0.5, 3.0], [0.7, 0.6, 2.5]])
+
+
+def dots(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """An image (H, W, 1) with a smooth dot around each pixel."""
+    columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+    squared = [(columns - x) ** 2 + (rows - y) ** 2 for x, y in pixels]
+    return (255 * np.exp(-np.array(squared) / 8).sum(axis=0)).round().clip(0, 255).astype(np.uint8)[..., None]
+
+
+@pytest.mark.parametrize("angle_deg", [0, 30, 45, 90, 135, 180, -70])
+def test_turned_raster_shows_points_where_its_camera_does(angle_deg: int) -> None:
+    image = dots(CAMERA.project(POSE.inverse().apply(X_IN_WORLD)), CAMERA)
+    camera, pose = turned(CAMERA, POSE, angle_deg)
+    raster = turned_pixels(image, CAMERA, angle_deg)
+    assert raster.shape[:2] == (camera.height_px, camera.width_px)
+    for x, y in camera.project(pose.inverse().apply(X_IN_WORLD)):
+        left, top = round(x) - 8, round(y) - 8
+        patch = raster[top : top + 17, left : left + 17].astype(float)
+        rows, columns = np.indices(patch.shape)
+        centre = np.array([(columns * patch).sum(), (rows * patch).sum()]) / patch.sum() + [left, top]
+        assert np.abs(centre - [x, y]).max() < 0.1
+
+
+def test_quarter_turns_keep_the_pixels_of_a_square_pinhole() -> None:
+    camera, pose = Camera(16, 10, 20.0, 20.0, 7.3, 4.1), POSE
+    image = np.random.default_rng(1).integers(0, 256, (10, 16, 3), dtype=np.uint8)
+    for quarters in range(4):
+        found_camera, found_pose = turned(Camera(16, 10, 20.0, 20.0, 7.3, 4.1), POSE, 90 * quarters)
+        assert np.array_equal(
+            turned_pixels(image, Camera(16, 10, 20.0, 20.0, 7.3, 4.1), 90 * quarters), np.rot90(image, quarters)
+        )
+        assert np.allclose(found_camera.matrix(), camera.matrix(), atol=1e-5)
+        assert np.allclose(found_pose.rotation, pose.rotation)
+        camera, pose = quarter_turn(camera, pose)
+
+
+def test_corners_that_the_photograph_does_not_show_are_black() -> None:
+    raster = turned_pixels(np.full((120, 160, 1), 200, np.uint8), CAMERA, 45)
+    assert raster[[0, 0, -1, -1], [0, -1, 0, -1]].max() == 0
+    assert raster[raster.shape[0] // 2, raster.shape[1] // 2] == 200
+
+
+def test_crossed_folders_are_never_of_one_place() -> None:
+    place_of = {folder: i for i, folders in enumerate(PLACES) for folder in folders}
+    pairs = crossed(200)
+    assert len(set(pairs)) == 200
+    assert all(place_of[a] != place_of[b] for a, b in pairs)
+    assert {a for a, _ in pairs} == set(FOLDERS)
+    assert len(crossed(2000)) == 2000
+
+
+def planted_folder(folder: Path) -> None:
+    (folder / "shelf/images").mkdir(parents=True)
+    frames = []
+    for i in range(6):
+        cv2.imwrite(str(folder / f"shelf/images/{i}.png"), np.zeros((4, 4), np.uint8))
+        k = [[5, 0, 1.5], [0, 5, 1.5], [0, 0, 1]]
+        pose = RigidTransform(np.eye(3), np.array([0.1 * i, 0, 0])).matrix().tolist()
+        frames.append({"image": f"images/{i}.png", "width": 4, "height": 4, "K": k, "world_from_camera": pose})
+    write_json(folder / "shelf/cameras.json", {"frames": frames, "metric": True})
+
+
+def test_list_names_what_was_expensive_and_is_asked_again(tmp_path: Path) -> None:
+    planted_folder(tmp_path)
+    rows = [
+        {"folder": "shelf", "references_stored": 3, "photograph": name, "processor_s": spent_s}
+        for name, spent_s in (("1", 2.5), ("3", 1.5), ("4", 9.0))
+    ]
+    write_list(rows, tmp_path / "list.json")
+    asked = list(doubtful(place_reader(tmp_path), tmp_path / "list.json"))
+    assert [(it.case.name, it.fields["references_stored"]) for it in asked] == [
+        ("1 in shelf-3", 3),
+        ("4 in shelf-3", 3),
+    ]
+    write_list([rows[0] | {"photograph": "gone"}], tmp_path / "list.json")
+    with pytest.raises(ValueError, match="shelf has no photograph gone"):
+        list(doubtful(place_reader(tmp_path), tmp_path / "list.json"))
+
+
+def turned_row(photograph: str, angle_deg: int, outcome: str, processor_s: float) -> dict[str, Any]:
+    return {
+        "folder": "shelf",
+        "photograph": photograph,
+        "angle_deg": angle_deg,
+        "outcome": outcome,
+        "processor_s": processor_s,
+        "attempts": [{}],
+    }
+
+
+def test_turned_photographs_are_compared_with_themselves_upright() -> None:
+    rows = [turned_row("a", 0, "right", 0.5), turned_row("b", 0, "LOW_OVERLAP", 9.0), turned_row("c", 0, "right", 1.0)]
+    rows += [turned_row("a", 90, "right", 1.0), turned_row("b", 90, "right", 1.0), turned_row("c", 90, "wrong", 4.0)]
+    assert by_angle(rows)[2:] == [
+        "| 0 | 2 | 2 (100 %) | 0 | 0 | 0.75 | 0.97 | 1.00 | 1.00 |",
+        "| 90 | 2 | 1 (50 %) | 1 | 0 | 2.50 | 3.85 | 3.00 | 3.33 |",
+    ]
+    assert by("degrees", lambda row: row["angle_deg"], rows)[-1] == "| all | 6 | 4 | 1 | 1 | 1.00 | 7.75 | 1.0 |"
