@@ -12,8 +12,8 @@ from mapless_tools.output_files import check_writable, markdown_table, write_jso
 from research.contradictions.asking import Row
 from research.contradictions.places import place_reader
 
-from .cases import EXPENSIVE_S, LIST, candidates, doubtful, other_places, turned_photographs, write_list
-from .in_process import accepted
+from .cases import ANGLES_DEG, EXPENSIVE_S, LIST, candidates, doubtful, other_places, turned_photographs, write_list
+from .in_process import QUERIES, accepted
 from .serving import answers
 from .tables import by, by_angle
 
@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True, help="file for the answers")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="every N-th photograph; default: all")
     parser.add_argument("--store", type=Path, help="folder of a store that remains, for later runs")
-    parser.add_argument("--list", action="store_true", help=f"doubtful: ask all candidates, and write {LIST.name}")
+    parser.add_argument("--list", action="store_true", help=f"doubtful: all candidates; writes {LIST.name}")
     parser.add_argument("--in-process", action="store_true", help="other-place: 2,000 queries without a server")
     parser.add_argument("--print", action="store_true", help="print the table of an existing file, and ask nothing")
     arguments = parser.parse_args()
@@ -36,36 +36,34 @@ def main() -> None:
         parser.error(f"--every must be at least 1, is {arguments.every}")
     if not arguments.print and arguments.scenes is None:
         parser.error("give SCENES")
+    for option, what in (("list", "doubtful"), ("in_process", "other-place")):
+        if getattr(arguments, option) and arguments.what != what:
+            parser.error(f"--{option.replace('_', '-')} goes with {what}")
     try:
         if arguments.print:
-            print("\n".join(table(arguments.what, json.loads(arguments.json.read_text())["answers"])))
-            return
-        check_writable(arguments.json)
-        measure(arguments)
+            rows = json.loads(arguments.json.read_text())["answers"]
+        else:
+            check_writable(arguments.json)
+            rows = measure(arguments)
+        if arguments.list:
+            write_list(rows)
+            rows = [it for it in rows if it["processor_s"] > EXPENSIVE_S]
     except (OSError, ValueError) as error:
         parser.error(str(error))
+    print("\n".join(outcomes(rows) if arguments.in_process else table(arguments.what, rows)))
 
 
-def measure(arguments: argparse.Namespace) -> None:
+def measure(arguments: argparse.Namespace) -> Sequence[Row]:
     """Asks what the arguments say."""
-    if arguments.what == "other-place" and arguments.in_process:
-        rows = ask(accepted(arguments.scenes), arguments.json)
-        print("\n".join(markdown_table("outcome | queries", Counter(it["outcome"] for it in rows).most_common())))
-        return
+    if arguments.in_process:
+        return ask(accepted(arguments.scenes, QUERIES // arguments.every), arguments.json)
     of = place_reader(arguments.scenes)
     kinds = {"other-place": other_places, "doubtful": doubtful, "turned": turned_photographs}
-    asked = list(candidates(of) if arguments.list else kinds[arguments.what](of))
-    if arguments.what == "turned":
-        # Whole photographs: one that is asked, is asked at every angle.
-        angles = len({it.fields["angle_deg"] for it in asked})
-        asked = [it for i, it in enumerate(asked) if i // angles % arguments.every == 0]
-    else:
-        asked = asked[:: arguments.every]
-    rows = ask(answers(asked, arguments.store), arguments.json, len(asked))
-    if arguments.list:
-        write_list(rows)
-        rows = [it for it in rows if it["processor_s"] > EXPENSIVE_S]
-    print("\n".join(table(arguments.what, rows)))
+    asked = list((candidates if arguments.list else kinds[arguments.what])(of))
+    # Whole photographs: one that is asked turned, is asked at every angle.
+    each = len(ANGLES_DEG) if arguments.what == "turned" else 1
+    asked = [it for i, it in enumerate(asked) if i // each % arguments.every == 0]
+    return ask(answers(asked, arguments.store), arguments.json, len(asked))
 
 
 def ask(answered: Iterable[Row], file: Path, count: int | None = None) -> Sequence[Row]:
@@ -81,6 +79,11 @@ def ask(answered: Iterable[Row], file: Path, count: int | None = None) -> Sequen
     write_json(file, {"answers": rows})
     print(f"{time.perf_counter() - begin_s:.0f} s", file=sys.stderr)
     return rows
+
+
+def outcomes(rows: Sequence[Row]) -> list[str]:
+    """How often each outcome came."""
+    return markdown_table("outcome | queries", Counter(it["outcome"] for it in rows).most_common())
 
 
 def table(what: str, rows: Sequence[Row]) -> list[str]:

@@ -20,10 +20,12 @@ def by(label: str, key: Callable[[Row], object], rows: Sequence[Row]) -> list[st
 
 def _cells(rows: Sequence[Row]) -> list[object]:
     right, wrong = (sum(row["outcome"] == it for row in rows) for it in ("right", "wrong"))
+    failed = sum(row["outcome"].startswith("failed") for row in rows)
+    rejected = len(rows) - right - wrong - failed
     spent_s = [row["processor_s"] for row in rows]
     tried = np.mean([len(row.get("attempts", ())) for row in rows])
     times = (f"{np.quantile(spent_s, share):.2f}" for share in (0.5, 0.95))
-    return [len(rows), right, wrong, len(rows) - right - wrong, *times, f"{tried:.1f}"]
+    return [len(rows), right, wrong, f"{rejected}, {failed} failed" if failed else rejected, *times, f"{tried:.1f}"]
 
 
 def by_angle(rows: Sequence[Row]) -> list[str]:
