@@ -4,12 +4,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from mapless import Client, NotFound
 from mapless_tools.child import CONNECT, ChildServer, child_server
-from research.contradictions.asking import Row, ask, processor_s, store
+from research.contradictions.asking import Row, ask, store
 from research.contradictions.places import Place
 
 from .cases import Asked
@@ -57,14 +57,28 @@ def _store_missing(client: Client, place: Place) -> None:
 
 
 def wait_until_idle(server: ChildServer) -> None:
-    """Waits until the server has computed next to nothing for `QUIET_S`: references are described and matched."""
+    """Waits until no thread but the main one has wanted a processor in `QUIET_S`: references are described and matched.
+
+    The main thread has the event loop, whose timers never rest.
+    """
     begin_s = reported_s = time.monotonic()
     while True:
-        before_s = processor_s(server)
+        before_s = _wanted_s(server)
         time.sleep(QUIET_S)
-        if processor_s(server) - before_s <= QUIET_SHARE * QUIET_S:
+        if all(wanted_s - before_s.get(it, 0.0) <= QUIET_SHARE * QUIET_S for it, wanted_s in _wanted_s(server).items()):
             return
         if time.monotonic() - reported_s >= REPORT_EVERY_S:
             reported_s = time.monotonic()
             waited_s = reported_s - begin_s
             print(f"{waited_s:.0f} s: the server still works on its references", file=sys.stderr, flush=True)
+
+
+def _wanted_s(server: ChildServer) -> dict[str, float]:
+    """Seconds that each thread but the main one has run, or has waited for a processor, by /proc/PID/task/TID."""
+    found = {}
+    for task in Path(f"/proc/{server.process_id}/task").iterdir():
+        with suppress(OSError):  # a thread that has ended meanwhile
+            run_ns, waited_ns, _ = map(int, (task / "schedstat").read_text().split())
+            found[task.name] = (run_ns + waited_ns) / 1e9
+    found.pop(str(server.process_id), None)
+    return found
