@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapless_server.scheduling import Flow
-from mapless_server.scheduling.expected import LATELY_S, MUCH_SHORTER, Expected
+from mapless_server.scheduling.expected import LATELY_S, MUCH_SHORTER, SHORTER, Expected
 from mapless_server.scheduling.fair_queue import FairQueue
 from mapless_server.scheduling.shares import CREDIT_S, MAX_IDLE, Shares
 
@@ -224,6 +224,7 @@ def test_what_is_expected_is_that_of_the_plain_search(
     for flow in set(every):
         others = [it for it in came if it[0].group != flow.group]
         is_shorter = [MUCH_SHORTER * its_s <= step_s and now_s - came_s <= step_s for _, its_s, came_s in others]
-        is_first = [now_s - came_s <= LATELY_S and shares.lead_s(flow, it) > 0 for it, _, came_s in others]
+        lately = [it for it in others if now_s - it[2] <= LATELY_S and SHORTER * it[1] <= step_s]
+        is_first = [shares.lead_s(flow, it) > 0 for it, _, _ in lately]
         assert expected.shorter(flow, step_s) == any(is_shorter)
-        assert expected.first(flow) == any(is_first)
+        assert expected.first(flow, step_s) == any(is_first)

@@ -104,7 +104,12 @@ class QueueEngine:
             observer or Observer(),
             failure_of,
             quota,
+            {HOST: options.workers},
         )
+
+    def answered(self, caller: Caller, is_localized: bool) -> None:
+        """Counts an answer: a caller whose last photographs all failed waits for the others."""
+        self.queue.answered(caller.flow, is_localized)
 
     def _is_alone(self) -> bool:
         """Whether the queue has one job only."""

@@ -95,7 +95,9 @@ class Ledger:
             holdings.aside += 1
 
     def resume(self, job: AnyJob, cost_s: Counter[str]) -> None:
-        """Undoes `set_aside`, with the computing time that is now predicted."""
+        """Undoes `set_aside`, if it was, with the computing time that is now predicted."""
+        if job not in self._aside:
+            return
         self._aside.remove(job)
         for holdings in self._holding(job.flow):
             holdings.aside -= 1

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from typing import Generic, TypeVar
 
+from .failing import FAILING
 from .jobs import Flow
 from .shares import Shares, Turn
 
@@ -101,5 +102,5 @@ class FurtherQueue(FairQueue[J]):
 
 
 def further(flow: Flow) -> Flow:
-    """As whom a client's further steps are charged."""
-    return Flow(flow.tenant, FURTHER, flow.caller)
+    """As whom a client's further steps are charged, and all that a failing caller asks for."""
+    return Flow(flow.tenant, FURTHER, flow.client if flow.caller == FAILING else flow.caller)

@@ -226,12 +226,13 @@ class Job(Generic[PayloadT, ValueT]):
     """A call's work, from admission to its end.
 
     Attributes:
-        flow: its owner.
+        flow: its owner, or as whom the scheduler has admitted it.
         step: its current step.
         deadline_s: when its result becomes useless, by the queue's clock.
         size_bytes: memory that it needs.
         on_end: called once, with how it ended and its result or exception.
         records: the stages that it has been through.
+        owner: its owner, once it was admitted.
         continues: whether it completes what other jobs of its call have computed; then it is always admitted, also
             while the server drains, since their work would otherwise be lost.
         used_s: computing time so far.
@@ -265,6 +266,7 @@ class Job(Generic[PayloadT, ValueT]):
     unusual_s: float = 0.0
     is_computed: bool = False
     timer_s: float = -math.inf
+    owner: Flow = Flow("", "")
     _life: _Life = field(default_factory=_Life)
 
     @property

@@ -20,10 +20,15 @@ class Lane:
         queues: the jobs that wait for each of them.
         aside: those that wait for each until a thread would be idle otherwise, or their turn as one caller comes.
         free: number of idle threads.
+        low_threads: number of threads besides, of low priority, which compute what waits aside; 0 if the others do.
+        low_free: number of idle ones of them.
         passed_over: batches since the first stage that has waiting jobs was served.
         busy_s: sum of the threads' computing times so far.
-        long: numbers of the batches that are computed of which a step is predicted to take more than a quantum.
-        arrivals: of the last jobs that have come to wait: owner, predicted time with later stages, time of arrival.
+        long: numbers of the batches that the threads compute of which a step is predicted to take more than a quantum,
+            and whether it is one that waited aside.
+        low: numbers of the batches that threads of low priority compute.
+        arrivals: of the last jobs that have come to wait, not aside: owner, predicted time with later stages, time of
+            arrival.
     """
 
     threads: int
@@ -31,10 +36,41 @@ class Lane:
     queues: Sequence[FairQueue[AnyJob]]
     aside: Sequence[FurtherQueue[AnyJob]]
     free: int
+    low_threads: int = 0
+    low_free: int = 0
     passed_over: int = 0
     busy_s: float = 0.0
-    long: set[int] = field(default_factory=set)
+    long: dict[int, bool] = field(default_factory=dict)
+    low: set[int] = field(default_factory=set)
     arrivals: deque[tuple[Flow, float, float]] = field(default_factory=lambda: deque(maxlen=_ARRIVALS))
+
+    def has_work(self, is_low: bool) -> bool:
+        """Whether a job waits for an idle thread, of low priority or not."""
+        if is_low:
+            return self.low_free > 0 and any(self.aside)
+        return self.free > 0 and (any(self.queues) or (not self.low_threads and any(self.aside)))
+
+    def begin(self, batch: int, is_low: bool) -> None:
+        """Counts a batch that is computed from now on."""
+        if is_low:
+            self.low_free -= 1
+            self.low.add(batch)
+        else:
+            self.free -= 1
+
+    def finish(self, batch: int) -> None:
+        """Undoes `begin`."""
+        self.long.pop(batch, None)
+        if batch in self.low:
+            self.low.remove(batch)
+            self.low_free += 1
+        else:
+            self.free += 1
+
+    def first_aside(self) -> Stage | None:
+        """The stage of the job aside whose turn it is among them; None if none waits."""
+        turns = [(turn, -i) for i, it in enumerate(self.aside) if (turn := it.turn(lambda _: True))]
+        return self.stages[-min(turns)[1]] if turns else None
 
     def stage_of_aside(self, is_allowed: Callable[[AnyJob], bool]) -> Stage | None:
         """The stage of the job aside whose turn it is; None if one that waits in order comes first, or none waits."""
@@ -43,10 +79,13 @@ class Lane:
         first = min(turns, default=None)
         return self.stages[-first[1]] if first and (not in_order or first[0] < min(in_order)) else None
 
-    @property
-    def has_one_left(self) -> bool:
-        """Whether all threads but one compute long steps."""
-        return len(self.long) >= self.threads - 1 > 0
+    def has_one_left(self, waits_aside: bool) -> bool:
+        """Whether all threads but one compute long steps.
+
+        Those that waited aside count for others of them only: what was admitted does not wait because of them.
+        """
+        long = sum(waits_aside or not waited_aside for waited_aside in self.long.values())
+        return long >= self.threads - 1 > 0
 
 
 _TRY_LARGER_AFTER = 64

@@ -1,7 +1,14 @@
-"""Processor time of a thread, with that of the threads that compute a part of its work."""
+"""Processor time of a thread, with that of the threads that compute a part of its work; and its priority."""
 
+import os
+import sys
 import threading
 import time
+from contextlib import suppress
+
+NICENESS = 10
+"""Of threads of low priority, above the process's own. Linux gives such a thread a tenth of a core that another thread
+of the process wants, and all of one that no other wants."""
 
 
 class _Helped(threading.local):
@@ -21,3 +28,14 @@ def processor_s() -> float:
 def count_helper(seconds: float) -> None:
     """Counts processor time that another thread has spent for the calling one."""
     _helped.seconds += seconds
+
+
+def lower_priority() -> None:
+    """Lets the calling thread, and those that it starts, compute only when others leave a core free, where possible.
+
+    Only Linux has a niceness of threads; elsewhere, or where it is not permitted, they share the cores equally.
+    """
+    if sys.platform == "linux":
+        with suppress(OSError):
+            own = threading.get_native_id()
+            os.setpriority(os.PRIO_PROCESS, own, os.getpriority(os.PRIO_PROCESS, own) + NICENESS)

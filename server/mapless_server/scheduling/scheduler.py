@@ -4,6 +4,7 @@ A state machine without threads, waiting or a clock: times are passed in, so tha
 """
 
 import itertools
+import math
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -11,7 +12,8 @@ from dataclasses import replace
 
 from .admission import Admission, Ledger, WorkQueueOptions
 from .costs import MAX_OF_CALLERS, CostModel, StageCosts
-from .expected import Expected
+from .expected import LATELY_S, Expected
+from .failing import FAILING, Failing
 from .fair_queue import FairQueue, FurtherQueue, further
 from .further import Further, When
 from .jobs import (
@@ -54,6 +56,7 @@ class Scheduler:
         observer: Observer,
         ending_of: Callable[[Exception], Ending] = lambda _: Ending.FAILED,
         quota: Quota | None = None,
+        low: Mapping[str, int] | None = None,
     ) -> None:
         """Makes an idle scheduler.
 
@@ -64,6 +67,7 @@ class Scheduler:
             observer: receives the events.
             ending_of: function that returns how a job ends whose stage returned this exception.
             quota: quota of the tenants; None if they are not limited.
+            low: number of threads of low priority that lanes have besides, for what waits aside; None for none.
         """
         self.costs = CostModel()
         self._options = options
@@ -72,6 +76,7 @@ class Scheduler:
         self._quota = quota
         self._stages = {stage.name: stage for stage in stages}
         self._stage_costs = StageCosts(self.costs, self._stages)
+        self._failing = Failing()
         self._shares = Shares()
         self._queues: dict[str, FairQueue[AnyJob]] = {stage.name: FairQueue(self._shares) for stage in stages}
         # Further steps of admitted jobs, which were not admitted with them.
@@ -81,7 +86,8 @@ class Scheduler:
         for name, count in lanes.items():
             own = [stage for stage in stages if stage.lane == name]
             queues, aside = [self._queues[it.name] for it in own], [self._aside[it.name] for it in own]
-            self._lanes[name] = Lane(count, own, queues, aside, count)
+            low_count = 0 if low is None else low.get(name, 0)
+            self._lanes[name] = Lane(count, own, queues, aside, count, low_count, low_count)
         self._limits: dict[tuple[str, str], BatchLimit] = {}
         self._first_steps: OrderedDict[tuple[tuple[str, str], str], AnyStep] = OrderedDict()
         self._ledger = Ledger(self._shares)
@@ -115,17 +121,36 @@ class Scheduler:
         queue, aside = self._queues[stage], self._aside[stage]
         return StageLoad(len(queue) + len(aside), queue.cost_s, self._running[stage])
 
+    def answered(self, flow: Flow, is_localized: bool, now_s: float) -> None:
+        """Counts whether a caller's photograph was localized, see `Failing`."""
+        self._failing.answered(flow, is_localized, now_s)
+
+    def others_ask(self, flow: Flow, now_s: float) -> bool:
+        """Whether another caller, which does not fail, has asked lately."""
+        return any(
+            now_s - came_s <= LATELY_S and other.group != flow.group
+            for lane in self._lanes.values()
+            for other, _, came_s in lane.arrivals
+        )
+
+    def is_failing(self, flow: Flow, now_s: float) -> bool:
+        """Whether a caller's last photographs all failed."""
+        return self._failing.is_failing(flow, now_s)
+
     def admit(self, job: AnyJob, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
+        if job.flow.caller != FAILING:  # else it was refused before
+            job.owner = job.flow
+        job.flow = self._failing.queued_as(job.owner, now_s)
         cost_s = self._stage_costs.of(job.step, job.flow, now_s)
         if not job.continues:
             self._remember(job.flow, job.step)
         with self._refusals_reported(job.flow, now_s):
             self._admission.check(job, cost_s, now_s)
             # The server's own jobs have no tenant and are free; a job that continues others is charged when it ends.
-            if self._quota is not None and job.flow.tenant and not job.continues:
+            if self._quota is not None and job.owner.tenant and not job.continues:
                 job.charged_s = cost_s.total()
-                wait_s = self._quota.charge(job.flow.tenant, job.flow.named_caller, job.charged_s, now_s)
+                wait_s = self._quota.charge(job.owner.tenant, job.owner.named_caller, job.charged_s, now_s)
                 if wait_s > 0:
                     raise Refused(Refusal.TENANT_QUOTA, "the tenant's computing time is used up", wait_s)
         self._observer.admitted(cost_s.total())
@@ -147,37 +172,43 @@ class Scheduler:
 
         That is a job as the caller's last one with this stage as its first, or with this step if there was none.
         """
+        flow = self._failing.queued_as(flow, now_s)
         step = self._first_steps.get((flow.group, step.stage), step)
         with self._refusals_reported(flow, now_s):
             self._admission.check_queue(flow, self._stage_costs.of(step, flow, now_s))
 
-    def has_work(self, lane_name: str) -> bool:
-        """Whether a job waits for an idle thread of a lane."""
-        lane = self._lanes[lane_name]
-        return lane.free > 0 and (any(lane.queues) or any(lane.aside))
+    def has_work(self, lane_name: str, is_low: bool = False) -> bool:
+        """Whether a job waits for an idle thread of a lane, of low priority or not."""
+        return self._lanes[lane_name].has_work(is_low)
 
-    def take(self, lane_name: str, now_s: float) -> Batch | None:
-        """Selects what a thread of a lane computes now; None if all threads are busy or no job waits."""
+    def take(self, lane_name: str, now_s: float, is_low: bool = False) -> Batch | None:
+        """Selects what a thread of a lane computes now; None if all threads are busy or no job waits.
+
+        A thread of low priority computes what waits aside, and then no other thread of the lane does.
+        """
         self.expire(now_s)
         lane = self._lanes[lane_name]
-        if not lane.free:
+        if not lane.has_work(is_low):
             return None
-
-        has_one_left = lane.has_one_left
+        if is_low:
+            stage = lane.first_aside()
+            return None if stage is None else self._take_aside(lane, stage, lambda _: True, now_s, is_low=True)
         expected: Expected | None = None
 
         def is_allowed(job: AnyJob) -> bool:
             nonlocal expected
-            if not has_one_left:
+            waits_aside = job.begins_until_s is not None
+            if not lane.has_one_left(waits_aside):
                 return True
             step_s = self._stage_costs.of_step(job, now_s)
             if step_s <= self._options.quantum_s:
                 return True
             expected = expected or Expected(lane.arrivals, self._shares, now_s)
-            return not (expected.shorter(job.flow, step_s) or expected.first(job.flow))
+            flow, long_s = (further(job.flow), math.inf) if waits_aside else (job.flow, step_s)
+            return not (expected.shorter(flow, step_s) or expected.first(flow, long_s))
 
         waiting = [it for it, queue in zip(lane.stages, lane.queues, strict=True) if any(map(is_allowed, queue))]
-        if (aside := lane.stage_of_aside(is_allowed)) is not None:
+        if not lane.low_threads and (aside := lane.stage_of_aside(is_allowed)) is not None:
             return self._take_aside(lane, aside, is_allowed, now_s)
         if not waiting:
             return None
@@ -190,23 +221,25 @@ class Scheduler:
             self._observer.waited(stage.name, now_s - job.waits_since_s)
         return self._begin(lane, stage, jobs, now_s)
 
-    def _take_aside(self, lane: Lane, stage: Stage, is_allowed: Callable[[AnyJob], bool], now_s: float) -> Batch:
-        """Selects further steps that wait aside for a stage."""
+    def _take_aside(
+        self, lane: Lane, stage: Stage, is_allowed: Callable[[AnyJob], bool], now_s: float, is_low: bool = False
+    ) -> Batch:
+        """Selects jobs that wait aside for a stage."""
         jobs = self._pop_batch(self._aside[stage.name], stage, is_allowed, now_s)
         for job in jobs:
             job.begins_until_s = None
             self._timers.set(job)
             self._ledger.resume(job, self._admission.bookable(self._stage_costs.of(job.step, job.flow, now_s)))
-        return self._begin(lane, stage, jobs, now_s)
+        return self._begin(lane, stage, jobs, now_s, is_low)
 
-    def _begin(self, lane: Lane, stage: Stage, jobs: tuple[AnyJob, ...], now_s: float) -> Batch:
-        lane.free -= 1
+    def _begin(self, lane: Lane, stage: Stage, jobs: tuple[AnyJob, ...], now_s: float, is_low: bool = False) -> Batch:
         for job in jobs:
             job.is_computed = True
         self._running[stage.name] += len(jobs)
         batch = Batch(stage, jobs, now_s, next(self._batch_number))
-        if self._stage_costs.of_step(jobs[0], now_s) > self._options.quantum_s:
-            lane.long.add(batch.number)
+        lane.begin(batch.number, is_low)
+        if not is_low and self._stage_costs.of_step(jobs[0], now_s) > self._options.quantum_s:
+            lane.long[batch.number] = jobs[0].is_aside
         return batch
 
     def finish(self, batch: Batch, results: Sequence[AnyResult], now_s: float, processor_s: float = 0.0) -> None:
@@ -216,9 +249,8 @@ class Scheduler:
         """
         stage, seconds = batch.stage, now_s - batch.start_s
         lane = self._lanes[stage.lane]
-        lane.free += 1
+        lane.finish(batch.number)
         lane.busy_s += seconds
-        lane.long.discard(batch.number)
         self._running[stage.name] -= len(batch.jobs)
         bucket = batch.jobs[0].step.bucket
         self._observer.computed(stage.name, bucket, len(batch.jobs), seconds)
@@ -320,19 +352,28 @@ class Scheduler:
                 return
             if when is When.ASIDE:
                 self._ledger.set_aside(job)
-                job.is_aside = True
-                job.begins_until_s = job.due_s - in_order_s
-                self._enqueue(job, in_order_s, now_s)
+                self._enqueue_aside(job, in_order_s, job.due_s - in_order_s, now_s)
                 return
         self._ledger.rebook(job, self._admission.bookable(cost_s))
         self._enqueue(job, in_order_s, now_s)
 
     def _enqueue(self, job: AnyJob, cost_s: float, now_s: float) -> None:
         """Lets a job wait for its step; the cost includes later stages."""
+        if job.flow.caller == FAILING:
+            self._enqueue_aside(job, cost_s, job.due_s, now_s)
+            return
         stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
         self._queue_of(job).push(job, job.flow, cost_s)
         self._lanes[stage.lane].arrivals.append((job.flow, cost_s, now_s))
+        self._timers.set(job)
+
+    def _enqueue_aside(self, job: AnyJob, cost_s: float, until_s: float, now_s: float) -> None:
+        """Lets a job wait aside for its step, at most until a time."""
+        job.is_aside = True
+        job.begins_until_s = until_s
+        job.waits_since_s = now_s
+        self._queue_of(job).push(job, job.flow, cost_s)
         self._timers.set(job)
 
     def _queue_of(self, job: AnyJob) -> FairQueue[AnyJob]:
@@ -370,10 +411,10 @@ class Scheduler:
             job.records.append(StageRecord(stage.name, job.waits_since_s, now_s, now_s, batch=0, jobs=0))
         self._ledger.close(job)
         job.end(ending, value)  # before the observer and the quota, which may raise
-        if self._quota is not None and job.flow.tenant:
+        if self._quota is not None and job.owner.tenant:
             # The batch that it is in has not been added to `used_s` yet.
             used_s = max(job.used_s, job.charged_s) if job.is_computed else job.used_s
-            self._quota.settle(job.flow.tenant, job.flow.named_caller, job.charged_s, used_s, now_s)
+            self._quota.settle(job.owner.tenant, job.owner.named_caller, job.charged_s, used_s, now_s)
         self._observer.ended(stage.name, ending)
 
     def _give_fallback(self, job: AnyJob, fallback: AnyFallback, now_s: float) -> None:

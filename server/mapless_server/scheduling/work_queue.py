@@ -26,7 +26,7 @@ from .jobs import (
     StageLoad,
     ValueT,
 )
-from .processor import processor_s
+from .processor import lower_priority, processor_s
 from .scheduler import Scheduler
 
 log = logging.getLogger(__name__)
@@ -34,6 +34,9 @@ log = logging.getLogger(__name__)
 ComputeBatch = Callable[[Sequence[AnyJob]], Sequence[AnyResult]]
 """Computes a step of jobs of one stage and bucket: a result for each, in order. If it raises instead, the batch is
 computed again in halves, so that only the job that causes the exception fails."""
+
+_Crew = tuple[str, bool]
+"""Threads of a lane: those of low priority, or the others."""
 
 
 class Failure(Enum):
@@ -71,6 +74,7 @@ class WorkQueue:
         observer: Observer,
         failure_of: Callable[[Exception], Failure] = lambda _: Failure.JOB_FAILED,
         quota: Quota | None = None,
+        low: Mapping[str, int] | None = None,
     ) -> None:
         """Makes an idle queue.
 
@@ -81,22 +85,24 @@ class WorkQueue:
             observer: receives the events.
             failure_of: function that classifies exceptions of stages.
             quota: quota of the tenants; None if they are not limited.
+            low: number of threads of low priority that lanes have besides, for what waits aside; None for none.
         """
         self._options = options
         self._observer = observer
         self._failure_of = failure_of
         self._compute = {stage.name: compute for stage, compute in stages.items()}
-        self._threads_of_lane = dict(lanes)
+        self._crews = {(lane, False): count for lane, count in lanes.items()}
+        self._crews |= {(lane, True): count for lane, count in (low or {}).items()}
 
         def ending_of(error: Exception) -> Ending:
             return failure_of(error).value or Ending.FAILED
 
-        self._scheduler = Scheduler(list(stages), lanes, options, observer, ending_of, quota)
-        # Guards the scheduler; held for microseconds. Each lane's idle threads wait on a condition of it. The
+        self._scheduler = Scheduler(list(stages), lanes, options, observer, ending_of, quota, low)
+        # Guards the scheduler; held for microseconds. Each crew's idle threads wait on a condition of it. The
         # event loop is called after a change: it wakes at once, and may need the lock next.
         self._lock = threading.Lock()
         self._for_loop: list[Callable[[], object]] = []
-        self._wakes_threads = {lane: threading.Condition(self._lock) for lane in lanes}
+        self._wakes_threads = {crew: threading.Condition(self._lock) for crew in self._crews}
         self._computing: set[Batch] = set()
         self._threads: list[threading.Thread] = []
         self._is_closed = False
@@ -141,8 +147,10 @@ class WorkQueue:
             self._loop = asyncio.get_running_loop()
             self._timer_task = self._loop.create_task(self._run_timer(), name="work queue")
             self._threads = [
-                threading.Thread(target=self._run_thread, args=(lane,), name=f"{lane}_{i}", daemon=True)
-                for lane, count in self._threads_of_lane.items()
+                threading.Thread(
+                    target=self._run_thread, args=(crew,), name=f"{crew[0]}_{'low_' if crew[1] else ''}{i}", daemon=True
+                )
+                for crew, count in self._crews.items()
                 for i in range(count)
             ]
             for thread in self._threads:
@@ -197,6 +205,17 @@ class WorkQueue:
         """
         with self._lock:
             self._scheduler.check_room(flow, step, time.monotonic())
+
+    def answered(self, flow: Flow, is_localized: bool) -> None:
+        """Counts whether a caller's photograph was localized, see `Failing`."""
+        with self._lock:
+            self._scheduler.answered(flow, is_localized, time.monotonic())
+
+    def is_failing_beside_others(self, flow: Flow) -> bool:
+        """Whether a caller's last photographs all failed, while others ask whose photographs do not."""
+        now_s = time.monotonic()
+        with self._lock:
+            return self._scheduler.is_failing(flow, now_s) and self._scheduler.others_ask(flow, now_s)
 
     def forget_costs(self) -> None:
         """Forgets the observed computing times, because those of later jobs will differ."""
@@ -266,14 +285,14 @@ class WorkQueue:
         except Exception as error:
             self._fail(error)
 
-    def _notify(self, own_lane: str = "") -> None:
+    def _notify(self, own: _Crew | None = None) -> None:
         """Wakes threads that have work, and the timer, after a change of the scheduler; the caller has the lock.
 
-        The calling thread's own lane is left out: that thread is about to take the next batch, and then wakes another
+        The calling thread's own crew is left out: that thread is about to take the next batch, and then wakes another
         one if there is more. A thread woken in vain costs two switches between threads.
         """
-        for lane, condition in self._wakes_threads.items():
-            if lane != own_lane and self._scheduler.has_work(lane):
+        for crew, condition in self._wakes_threads.items():
+            if crew != own and self._scheduler.has_work(*crew):
                 condition.notify()
         due_s = self._scheduler.next_due_s
         if due_s is not None and due_s < self._timer_at_s and self._loop is not None:
@@ -299,36 +318,39 @@ class WorkQueue:
         finally:
             self.on_fatal(fatal)
 
-    def _run_thread(self, lane: str) -> None:
+    def _run_thread(self, crew: _Crew) -> None:
         assert self._loop is not None
         try:
-            while (batch := self._next_batch(lane)) is not None:
+            if crew[1]:
+                lower_priority()
+            while (batch := self._next_batch(crew)) is not None:
                 begin_s = processor_s()
                 results = self._compute_batch(batch.stage, batch.jobs)
                 spent_s = processor_s() - begin_s
                 with self._changing():
                     self._computing.discard(batch)
                     self._scheduler.finish(batch, results, time.monotonic(), spent_s)
-                    self._notify(lane)
+                    self._notify(crew)
                 # An idle thread must not keep photographs and tensors alive.
                 del batch, results
         except BaseException as error:  # SystemExit too: the queue must not go on without this thread
             self._loop.call_soon_threadsafe(self._fail, error)
 
-    def _next_batch(self, lane: str) -> Batch | None:
+    def _next_batch(self, crew: _Crew) -> Batch | None:
         """Waits for the next batch; None when the queue is closed."""
         while True:
             with self._changing():
                 if self._is_closed:
                     return None
-                batch = self._scheduler.take(lane, time.monotonic())
+                lane, is_low = crew
+                batch = self._scheduler.take(lane, time.monotonic(), is_low)
                 if batch is not None:
                     self._computing.add(batch)
-                    if self._scheduler.has_work(lane):
-                        self._wakes_threads[lane].notify()
+                    if self._scheduler.has_work(*crew):
+                        self._wakes_threads[crew].notify()
                     return batch
                 if not self._for_loop:  # jobs that are due have ended, otherwise
-                    self._wakes_threads[lane].wait()
+                    self._wakes_threads[crew].wait()
 
     def _compute_batch(self, stage: Stage, jobs: Sequence[AnyJob]) -> list[AnyResult]:
         """Computes the stage's result for each job; if the stage raises, computes halves of the batch."""

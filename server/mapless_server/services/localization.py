@@ -250,7 +250,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         call: Call,
         scale: MetricScale | None = None,
     ) -> None:
-        """Reports an answer, a rejection or the message of any localization, to the log and the metrics."""
+        """Reports an answer, a rejection or the message of any localization, to the queue, the log and the metrics."""
+        self._engine().answered(call.caller, not isinstance(outcome, Rejection))
         for result in results:
             self._metrics.stages(result.stage_seconds)
             if TRACK in result.stage_seconds:

@@ -84,11 +84,17 @@ def neighbours_command(
     deadline_s: Deadline = 30.0,
     step_s: Annotated[float, typer.Option(help="Seconds alone, and seconds beside the neighbour.")] = 60.0,
     clients: Clients = 4,
+    callers: Annotated[int, typer.Option(help="The neighbour's calls side by side, or the lost robots.")] = 8,
+    own_tokens: Annotated[
+        bool,
+        typer.Option("--own-tokens", help="Each robot has a token of its own, and so has each lost one beside them."),
+    ] = False,
     seed: Seed = 0,
     output: Output = OUTPUT,
 ) -> None:
     """A fleet under its token, alone and beside another token whose calls are endless and each of a new client."""
     given = {"deadline_s": deadline_s, "step_s": step_s, "clients": clients, "seed": seed}
+    given |= {"callers": callers, "own_tokens": own_tokens}
     _finish(_neighbours(data, elsewhere, quick, output, **given))
 
 

@@ -7,6 +7,7 @@ import asyncio
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from typing import Any
 
@@ -41,11 +42,11 @@ async def connected(
     clients: int,
     deadline_s: float,
     read_answer: ReadAnswer,
-    metadata: Callable[[], Metadata] = tuple,
+    metadata: Callable[[int], Metadata] = lambda _: (),
 ) -> AsyncIterator[Target]:
     """Connects several clients to a method, "/package.Service/Method", until the end of the block.
 
-    `metadata` makes the metadata of each call.
+    `metadata` makes the metadata of each call of a client, by its index.
     """
     options = [
         # Channels to one address share a connection otherwise, and the server would see one client.
@@ -60,7 +61,8 @@ async def connected(
     try:
         for channel in channels:
             await asyncio.wait_for(channel.channel_ready(), 30)
-        yield Target([_with_metadata(it.unary_unary(method), metadata) for it in channels], deadline_s, read_answer)
+        methods = [_with_metadata(it.unary_unary(method), partial(metadata, i)) for i, it in enumerate(channels)]
+        yield Target(methods, deadline_s, read_answer)
     finally:
         for channel in channels:
             await channel.close()
@@ -100,17 +102,16 @@ async def send_closed_loop(
     records: list[CallRecord] = []
     numbers = count()
 
-    async def keep_calling() -> None:
+    async def keep_calling(client: int) -> None:
         while (at_s := loop.time() - begin_s) < duration_s:
-            number = next(numbers)
-            planned = PlannedCall(at_s, number, Kind.QUERY, requests[number % len(requests)])
+            planned = PlannedCall(at_s, client, Kind.QUERY, requests[next(numbers) % len(requests)])
             record = await _call(target, planned, begin_s)
             records.append(record)
             if record.fate is Fate.REFUSED and waits_if_refused:
                 left_s = max(0.0, begin_s + duration_s - loop.time())
                 await asyncio.sleep(min(record.retry_after_s or REFUSED_PAUSE_S, left_s))
 
-    await asyncio.gather(*(keep_calling() for _ in range(concurrency)))
+    await asyncio.gather(*map(keep_calling, range(concurrency)))
     return records
 
 

@@ -258,6 +258,9 @@ class _Recomputing:
         stages = QueryStages(self._tiers, self.options.doubt, self._method)
         return await asyncio.to_thread(_compute, stages, job, partial(followed, attempts, self._tiers))
 
+    def answered(self, caller: Caller, is_localized: bool) -> None:
+        pass
+
     @contextmanager
     def hold(self, queries: Sequence[Query], caller: Caller) -> Iterator[None]:
         yield
