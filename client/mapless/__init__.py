@@ -29,7 +29,7 @@ from .answers import (
 )
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
-from .diagnostics import Attempt, Debug, Diagnostics, ReferenceUse, ScaleEstimate
+from .diagnostics import Attempt, Debug, Diagnostics, LadderCut, ReferenceUse, ScaleEstimate
 from .errors import (
     AlreadyExists,
     DataLoss,
@@ -95,6 +95,7 @@ __all__ = [
     "IntrinsicsCheck",
     "IntrinsicsUncertainty",
     "InvalidArgument",
+    "LadderCut",
     "LocalizationResult",
     "MaplessError",
     "NewReference",

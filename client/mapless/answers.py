@@ -243,6 +243,7 @@ class LocalizationResult:
         captured = f", {_CAPTURED}" if self.diagnostics.captured else ""
         tracked = ", tracked" if self.diagnostics.is_tracked else ""
         text.append(f"  support   {_support(self)}, {self.diagnostics.total_s:.2f} s{tracked}{captured}")
+        text += [f"  cut       {it}" for it in self.diagnostics.ladder_cuts]
         if self.arbitrary_unit:
             text.append("  warning   the scene's unit of length is arbitrary, not the metre")
         if self.scale_source == "NETWORK":
@@ -288,6 +289,7 @@ class Rejected:
             if it.in_axes is not None and it.in_axes.axes != "OPENCV":
                 pose, frame = it.in_axes.world_from_camera, f", in {it.in_axes.axes} axes"
             text += [f"  the pose that is too imprecise{frame}:", *pose_lines(pose, it.accuracy, it.arbitrary_unit)]
+        text += [f"  {it}" for it in self.diagnostics.ladder_cuts]
         if self.diagnostics.captured:
             text.append(f"  {_CAPTURED}")
         return "\n".join(text)

@@ -60,6 +60,40 @@ class Attempt:
 
 
 @dataclass(frozen=True)
+class LadderCut:
+    """Attempts that were left out, or one that was not finished, for another reason than what the photograph shows.
+
+    Attributes:
+        rung: the first attempt that was left out, or that was not finished.
+        features: the local features that it would have used.
+        reason: the value of LadderCutReason without its prefix: "NO_TIME", or "CALLER_FAILS" where the caller's last
+            photographs all failed and others ask.
+        unmatched_reference_count: references with which a network did not match the photograph any more, though the
+            attempt was made; else 0.
+    """
+
+    rung: str
+    features: str
+    reason: str
+    unmatched_reference_count: int = 0
+
+    def __str__(self) -> str:
+        reason = _CUT_REASONS.get(self.reason, self.reason)
+        if self.unmatched_reference_count:
+            return f"{self.rung} with {self.unmatched_reference_count} references fewer: {reason}"
+        return f"{self.rung} left out or not finished: {reason}"
+
+
+_CUT_REASONS = {
+    "NO_TIME": "no time",
+    "CALLER_FAILS": "this caller's last photographs all failed, and others ask",
+    "FEATURES_MISSING": "features of references are not stored yet",
+    "OUT_OF_MEMORY": "too little memory",
+    "FAILED": "an error, which is in the server's log",
+}
+
+
+@dataclass(frozen=True)
 class Diagnostics:
     """Data and software that an answer was computed from, and the time it took.
 
@@ -77,6 +111,8 @@ class Diagnostics:
         processor_s: processor time of the server's own threads for this photograph, seconds.
         stationary_keypoint_count: keypoints that were left out because they are fixed to the camera, such as a bonnet.
         attempts: the attempts that were made, in order; none of a server older than 0.4.
+        ladder_cuts: attempts that were left out or not finished for lack of time or memory, or because others ask;
+            asking again may help.
     """
 
     request_id: str
@@ -98,6 +134,7 @@ class Diagnostics:
     processor_s: float = 0.0
     stationary_keypoint_count: int = 0
     attempts: tuple[Attempt, ...] = ()
+    ladder_cuts: tuple[LadderCut, ...] = ()
 
     @property
     def is_tracked(self) -> bool:

@@ -18,7 +18,7 @@ from support.planted_engine import (
 )
 from support.servers import CAMERA, pose
 
-from mapless_server.engine.query import Result, Tried
+from mapless_server.engine.query import CutReason, LadderCut, Result, Tried
 from mapless_server.engine.search import Material, Search
 from mapless_server.engine.verdicts import Verdicts
 from mapless_server.method import ladder
@@ -31,6 +31,8 @@ from mapless_server.method.ladder import Rung
 from mapless_server.method.options import DoubtOptions
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing
+from mapless_server.scheduling import Flow, failing
+from mapless_server.scheduling.failing import FAILURES
 
 
 def ended(result: Result) -> list[tuple[str, str, bool]]:
@@ -104,6 +106,44 @@ def test_better_answers_are_sent_before_the_last(setting: Setting) -> None:
     final = setting.loop.run_until_complete(run())
     assert [it.tier.features for it in [*sent, final]] == ["cheap", "strong"]
     assert [len(it.attempts) for it in [*sent, final]] == [1, 2]
+
+
+@pytest.mark.parametrize(("is_cut", "asked"), [(True, ["cheap"]), (False, ["cheap", "strong"])])
+def test_a_cut_ladder_has_its_cheap_rungs(setting: Setting, is_cut: bool, asked: list[str]) -> None:
+    """The result says which rung was left out, and the same cut made again gives the same result."""
+    setting.replies = {"cheap": rejected(), "strong": rejected()}
+    results = list[Result]()
+    for is_cut_at in (lambda *_: is_cut, lambda *it: it in [(cut.rung, cut.features) for cut in results[0].cuts]):
+        setting.asked.clear()
+        job = setting.engine.query_job(query_of(("r0", "r1")), caller())
+        job.step = replace(job.step, payload=replace(job.step.payload, is_cut_at=is_cut_at))
+        results.append(setting.loop.run_until_complete(setting.engine.run(job)))
+        assert [*dict.fromkeys(setting.asked)] == asked
+    first, second = results
+    assert first.cuts == ((LadderCut("stronger", "strong", CutReason.CALLER_FAILS),) if is_cut else ())
+    assert second.cuts == first.cuts
+    assert ended(second) == ended(first)
+
+
+def test_a_caller_that_fails_beside_others_gets_a_cut_ladder(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only while others ask, and until one of its photographs is localized."""
+    monkeypatch.setattr(failing, "LATELY_S", 60.0)
+    setting.replies = {"cheap": rejected(), "strong": rejected()}
+
+    def cuts(name: str = "lost") -> list[CutReason]:
+        asking = replace(caller(), flow=Flow("t", name))
+        result = setting.run(query_of(("r0", "r1")), asking)[0]
+        setting.engine.answered(asking, isinstance(result.answer.outcome, Localization))
+        return [it.reason for it in result.cuts]
+
+    assert [cuts() for _ in range(FAILURES + 1)] == [[]] * (FAILURES + 1)
+    cuts("other")
+    assert cuts() == [CutReason.CALLER_FAILS]
+    setting.replies = {"cheap": localized(SURE_INLIERS)}
+    cuts()
+    setting.replies = {"cheap": rejected(), "strong": rejected()}
+    cuts("other")
+    assert cuts() == []
 
 
 def test_a_further_attempt_is_one_row(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -220,3 +220,16 @@ def test_a_further_step_of_an_earlier_stage_has_its_turn() -> None:
         toy.fill("busy")
         toy.finish(toy.take("host"), Done(None))
     assert sum(it.is_over for it in jobs) < len(jobs) / 2
+
+
+@pytest.mark.parametrize("has_begun", [True, False])
+def test_an_attempt_that_has_begun_goes_on_though_jobs_are_refused(has_begun: bool) -> None:
+    """What was computed of it would be lost otherwise."""
+    toy = Toy()
+    job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
+    batch = toy.take("host")
+    toy.fill()
+    fallback = Fallback[object, str](lambda _: Done("first"), 150.0)
+    toy.learn("prepare", "slow", 50.0)
+    toy.finish(batch, Next((Step("prepare", "slow", "b", "next"),), fallback, has_begun=has_begun))
+    assert job.is_over != has_begun

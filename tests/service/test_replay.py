@@ -38,6 +38,7 @@ from mapless import (
 )
 from mapless.geometry import RigidTransform as Pose
 from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.query import CutReason, LadderCut
 from mapless_server.method.judge.hypothesis import Attempt
 from mapless_server.scheduling import Next, Step
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call, encode_call
@@ -328,13 +329,28 @@ THEN = [("as it is", "cheap", "gate"), ("lines", "cheap", "gate"), ("stronger", 
 )
 def test_attempts_are_those_of_the_captured_answer(steps: list[str], count: int, expected: tuple[str, bool]) -> None:
     """In its order; and one that had no result then has none again, as if there were no time."""
-    then = [pb.Attempt(rung=r, features=f, outcome=o) for r, f, o in THEN]
+    then = pb.Diagnostics(attempts=[pb.Attempt(rung=r, features=f, outcome=o) for r, f, o in THEN])
     tiers: Any = [SimpleNamespace(features=it) for it in ("cheap", "strong")]
     payloads: Any = [
-        SimpleNamespace(rung=it, attempt=Attempt(int(it == "stronger")), attempts=(None,) * count) for it in steps
+        SimpleNamespace(rung=it, attempt=Attempt(int(it == "stronger")), attempts=(None,) * count, cuts=())
+        for it in steps
     ]
     step, had_result = followed(then, tiers, Next(tuple(Step("", "", "", it) for it in payloads)))
     assert (step.payload.rung, had_result) == expected
+
+
+@pytest.mark.parametrize(("unmatched", "expected"), [(2, 1), (1, 0), (0, 0)])
+def test_references_not_matched_then_are_not_matched_again(unmatched: int, expected: int) -> None:
+    """A network had matched some of them when the time was over."""
+    then = pb.Diagnostics(
+        attempts=[pb.Attempt(rung="rematched", features="strong", outcome="gate")],
+        ladder_cuts=[pb.LadderCut(rung="rematched", features="strong", unmatched_reference_count=unmatched)],
+    )
+    cuts = (), (LadderCut("rematched", "strong", CutReason.NO_TIME, 2),)
+    payloads: Any = [SimpleNamespace(rung="rematched", attempt=Attempt(0), attempts=(), cuts=it) for it in cuts]
+    steps = tuple(Step("", "", "", it) for it in payloads)
+    tiers: Any = [SimpleNamespace(features="strong")]
+    assert followed(then, tiers, Next(steps)) == (steps[expected], True)
 
 
 def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:

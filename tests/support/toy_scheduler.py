@@ -63,9 +63,9 @@ class PlantedQuota:
 class Toy:
     """A scheduler that has learned what its stages cost, and its jobs."""
 
-    def __init__(self, options: WorkQueueOptions = OPTIONS, quota: Any = None) -> None:
+    def __init__(self, options: WorkQueueOptions = OPTIONS, quota: Any = None, low: int = 0) -> None:
         self.observer = CountingObserver()
-        self.scheduler = Scheduler(STAGES, LANES, options, self.observer, quota=quota)
+        self.scheduler = Scheduler(STAGES, LANES, options, self.observer, quota=quota, low={"host": low})
         self.ends: dict[int, list[tuple[Ending, Any]]] = {}
         self.jobs: list[AnyJob] = []
         self.now_s = 0.0
@@ -102,8 +102,8 @@ class Toy:
         assert len(ends) <= 1
         return ends[0][0] if ends else None
 
-    def take(self, lane: str) -> Batch:
-        batch = self.scheduler.take(lane, self.now_s)
+    def take(self, lane: str, is_low: bool = False) -> Batch:
+        batch = self.scheduler.take(lane, self.now_s, is_low)
         assert batch is not None
         return batch
 

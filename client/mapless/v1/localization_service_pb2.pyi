@@ -96,6 +96,15 @@ class RejectionReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REJECTION_REASON_AMBIGUOUS: _ClassVar[RejectionReason]
     REJECTION_REASON_PRIOR_CONFLICT: _ClassVar[RejectionReason]
 
+class LadderCutReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    LADDER_CUT_REASON_UNSPECIFIED: _ClassVar[LadderCutReason]
+    LADDER_CUT_REASON_NO_TIME: _ClassVar[LadderCutReason]
+    LADDER_CUT_REASON_CALLER_FAILS: _ClassVar[LadderCutReason]
+    LADDER_CUT_REASON_FEATURES_MISSING: _ClassVar[LadderCutReason]
+    LADDER_CUT_REASON_OUT_OF_MEMORY: _ClassVar[LadderCutReason]
+    LADDER_CUT_REASON_FAILED: _ClassVar[LadderCutReason]
+
 class ScaleStage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     SCALE_STAGE_UNSPECIFIED: _ClassVar[ScaleStage]
@@ -159,6 +168,12 @@ REJECTION_REASON_PNP_FAILED: RejectionReason
 REJECTION_REASON_GATE: RejectionReason
 REJECTION_REASON_AMBIGUOUS: RejectionReason
 REJECTION_REASON_PRIOR_CONFLICT: RejectionReason
+LADDER_CUT_REASON_UNSPECIFIED: LadderCutReason
+LADDER_CUT_REASON_NO_TIME: LadderCutReason
+LADDER_CUT_REASON_CALLER_FAILS: LadderCutReason
+LADDER_CUT_REASON_FEATURES_MISSING: LadderCutReason
+LADDER_CUT_REASON_OUT_OF_MEMORY: LadderCutReason
+LADDER_CUT_REASON_FAILED: LadderCutReason
 SCALE_STAGE_UNSPECIFIED: ScaleStage
 SCALE_STAGE_TRIANGULATION: ScaleStage
 SCALE_STAGE_TRAJECTORY: ScaleStage
@@ -485,7 +500,7 @@ class Hypothesis(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., inlier_count: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., arbitrary_unit: bool = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ...) -> None: ...
 
 class Diagnostics(_message.Message):
-    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "attempts", "stationary_keypoint_count")
+    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "attempts", "stationary_keypoint_count", "ladder_cuts")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     BACKEND_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -505,6 +520,7 @@ class Diagnostics(_message.Message):
     PROCESSOR_DURATION_FIELD_NUMBER: _ClassVar[int]
     ATTEMPTS_FIELD_NUMBER: _ClassVar[int]
     STATIONARY_KEYPOINT_COUNT_FIELD_NUMBER: _ClassVar[int]
+    LADDER_CUTS_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     backend: str
     weights_sha256: str
@@ -524,7 +540,20 @@ class Diagnostics(_message.Message):
     processor_duration: _duration_pb2.Duration
     attempts: _containers.RepeatedCompositeFieldContainer[Attempt]
     stationary_keypoint_count: int
-    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ...) -> None: ...
+    ladder_cuts: _containers.RepeatedCompositeFieldContainer[LadderCut]
+    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ..., ladder_cuts: _Optional[_Iterable[_Union[LadderCut, _Mapping]]] = ...) -> None: ...
+
+class LadderCut(_message.Message):
+    __slots__ = ("rung", "features", "reason", "unmatched_reference_count")
+    RUNG_FIELD_NUMBER: _ClassVar[int]
+    FEATURES_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    UNMATCHED_REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    rung: str
+    features: str
+    reason: LadderCutReason
+    unmatched_reference_count: int
+    def __init__(self, rung: _Optional[str] = ..., features: _Optional[str] = ..., reason: _Optional[_Union[LadderCutReason, str]] = ..., unmatched_reference_count: _Optional[int] = ...) -> None: ...
 
 class Attempt(_message.Message):
     __slots__ = ("rung", "features", "outcome", "duration", "processor_duration", "chosen")

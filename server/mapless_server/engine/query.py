@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -286,6 +287,34 @@ class Tried:
     is_chosen: bool = False
 
 
+class CutReason(str, Enum):
+    """Reasons, other than what the photograph shows, why an attempt is left out or not finished."""
+
+    NO_TIME = "no_time"
+    CALLER_FAILS = "caller_fails"
+    """The caller's last photographs all failed, and others ask: it gets the cheap rungs."""
+    FEATURES_MISSING = "features_missing"
+    OUT_OF_MEMORY = "out_of_memory"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class LadderCut:
+    """Where the ladder was cut for another reason than what the photograph shows.
+
+    Attributes:
+        rung: name of the rung of the attempt that was left out, or not finished.
+        features: the local features' name with their options.
+        reason: why.
+        unmatched: if the attempt was made with fewer matches, number of references that the network did not match.
+    """
+
+    rung: str
+    features: str
+    reason: CutReason
+    unmatched: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The answer to a query, and the data that it was computed from.
@@ -301,6 +330,7 @@ class Result:
         stage_seconds: time of every stage that was computed, in order, of all attempts. The name of a stage of other
             features, references or rasters than the first ones begins with the extractor's name and a slash.
         attempts: the attempts that were made, in order.
+        cuts: attempts that were left out, or not finished, for another reason than what the photograph shows.
     """
 
     answer: Answer
@@ -312,6 +342,7 @@ class Result:
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
     stage_seconds: dict[str, float] = field(default_factory=dict)
     attempts: tuple[Tried, ...] = ()
+    cuts: tuple[LadderCut, ...] = ()
 
     @property
     def is_tracked(self) -> bool:

@@ -131,6 +131,7 @@ class QueueEngine:
         """
         views = QueryViews(query.photo, self.options.image_limits)
         search = Search.begin(query, source or self.references, views, caller.deadline_s)
+        search = replace(search, is_cut_at=lambda *_: self.queue.gets_cheap_steps(caller.flow))
         if on_better is not None:
             loop = asyncio.get_running_loop()
             search = replace(search, on_better=lambda result: loop.call_soon_threadsafe(on_better, result))

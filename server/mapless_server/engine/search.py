@@ -18,7 +18,7 @@ from mapless_server.scenes import Choice
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
 from mapless_server.store import SceneAttributes
 
-from .query import PREPARE, REFINE, Query, ReferenceSource, Result, Tried
+from .query import PREPARE, REFINE, CutReason, LadderCut, Query, ReferenceSource, Result, Tried
 
 if TYPE_CHECKING:  # services need not load what computes
     from collections.abc import Sequence
@@ -106,6 +106,8 @@ class Search:
         found: their results; those that had none left out.
         materials: for each result, what it was computed from.
         attempts: how each attempt ended.
+        cuts: attempts that were left out, or not finished, for another reason than what the photograph shows.
+        is_cut_at: whether the caller gets cheap rungs only, though one follows that is not, of a name and features.
         verdict: what is answered by now; None before the first result.
         start_s: when the attempt began to wait for the queue, by `time.monotonic`.
         give_up_s: time after which the verdict so far is the answer, if the attempt has no result by then.
@@ -133,6 +135,8 @@ class Search:
     found: tuple[Found, ...] = ()
     materials: tuple[Material, ...] = ()
     attempts: tuple[Tried, ...] = ()
+    cuts: tuple[LadderCut, ...] = ()
+    is_cut_at: Callable[[str, str], bool] = lambda rung, features: False
     verdict: Verdict | None = None
     start_s: float = field(default_factory=time.monotonic)
     give_up_s: float = math.inf
@@ -200,6 +204,15 @@ class Search:
             context=StageContext(self.context.check) if is_other else self.context,
             spent_s=self.seconds(features) if is_other else self.spent_s,
         )
+
+    def cut(self, rung: str, features: str, reason: CutReason, unmatched: int = 0) -> Search:
+        """The search with another cut of the ladder."""
+        return replace(self, cuts=(*self.cuts, LadderCut(rung, features, reason, unmatched)))
+
+    @property
+    def gets_cheap_rungs(self) -> bool:
+        """Whether the ladder was cut to its cheap rungs."""
+        return any(it.reason is CutReason.CALLER_FAILS for it in self.cuts)
 
     def seconds(self, features: str) -> dict[str, float]:
         """Time of every stage so far; those of the present photographs after the first ones begin with `features`."""

@@ -36,9 +36,9 @@ from mapless_server.scheduling import (
     processor_s,
 )
 
-from . import choosing, tracking
+from . import choosing, cutting, tracking
 from .failures import failure_of
-from .query import COARSE, PREPARE, REFINE, TRACK, Result, Tier
+from .query import COARSE, PREPARE, REFINE, TRACK, CutReason, LadderCut, Result, Tier
 from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
 from .verdicts import Verdicts, attributes_of
 
@@ -143,10 +143,11 @@ class QueryStages:
                 )
             # A failed attempt at a better answer must not cost the answer that there is.
             if isinstance(error, FeaturesMissing):  # which the library makes after the call
-                return self._unfinished(search, "unfinished")
+                return self._unfinished(search, "unfinished", CutReason.FEATURES_MISSING)
             log.warning("the attempt %r failed; the answer before it is given", search.rung, exc_info=error)
             is_full = failure_of(error) is Failure.OUT_OF_MEMORY
-            return self._unfinished(search, "out_of_memory" if is_full else "failed")
+            reason = CutReason.OUT_OF_MEMORY if is_full else CutReason.FAILED
+            return self._unfinished(search, reason.value, reason)
 
     def _prepare(self, search: Search, job: SearchJob) -> SearchResult:
         attempt = search.attempt
@@ -216,7 +217,7 @@ class QueryStages:
         """Matches the next reference, or goes on with the query if all are matched or no time is left for more."""
         material = search.material
         assert material is not None
-        matched = replace(search, material=replace(material, unmatched=()))
+        matched = cutting.without_unmatched(search, self._verdicts.tier(search.attempt).features)
         if self._has_time_to_rematch(search):
             # If the queue finds no time for that, the pose is computed from the matches there are.
             names = [f"{search.kind}, {it}" for it in ("rematch", "matched")]
@@ -313,7 +314,8 @@ class QueryStages:
         result = replace(result, attempts=tried)
         if search.on_better is not None and isinstance(result.answer.outcome, Localization):
             search.on_better(result)
-        done = Done(result, Ending.DEGRADED)
+        cut = LadderCut(search.rung, self._verdicts.tier(search.attempt).features, CutReason.NO_TIME)
+        done = Done(replace(result, cuts=(cut,)), Ending.DEGRADED)
         return Next((step,), Fallback(lambda _: done, search.deadline_s - ANSWER_MARGIN_S), is_admitted=True)
 
     def _refine(self, search: Search) -> SearchResult:
@@ -356,14 +358,14 @@ class QueryStages:
         if search.verdict is None:  # near the prior there was none
             first = search.to(ladder.AS_IT_IS, Attempt(), search.give_up_s, self._tiers[0].features)
             return self._next(first, first.first_step)
-        steps = []
         features = self._verdicts.tier(search.attempt).features
         before = search.before or search.attempt
         now_s = time.monotonic()
         give_up_s = now_s + TIME_SHARE * (search.deadline_s - now_s)
         situation, doubts = search.situation(self._tiers), search.verdict.doubts
-        for rung, attempt in ladder.further(before, search.best, search.tried, doubts, situation):
-            steps.append(search.to(rung.name, attempt, give_up_s, features).first_step)
+        following = ladder.further(before, search.best, search.tried, doubts, situation)
+        search, rungs = cutting.offered(search, following, lambda it: self._verdicts.tier(it).features)
+        steps = [chosen.to(rung.name, it, give_up_s, features).first_step for chosen, rung, it in rungs]
         return self._next(steps[0].payload, *steps) if steps else self._done(search)
 
     def _skipped(self, search: Search, outcome: str = SKIPPED) -> SearchResult:
@@ -375,14 +377,17 @@ class QueryStages:
         steps = tuple(replace(it, payload=it.payload.paused(search)) for it in steps)
         if search.verdict is None:
             return Next(steps)
-        return Next(steps, Fallback(lambda waiting: self._unfinished(waiting, "unfinished"), search.give_up_s))
+        fallback = Fallback(self._unfinished, search.give_up_s)
+        return Next(steps, fallback, has_begun=search.stage_start_s is not None)
 
     def _done(self, search: Search) -> Done[Result]:
         answered = self._verdicts.answer(search)
         return Done(answered, _ending(answered))
 
-    def _unfinished(self, search: Search, outcome: str) -> Done[Result]:
-        answered = self._verdicts.without_present(search, outcome)
+    def _unfinished(
+        self, search: Search, outcome: str = "unfinished", reason: CutReason = CutReason.NO_TIME
+    ) -> Done[Result]:
+        answered = self._verdicts.without_present(search, outcome, reason)
         return Done(answered, _ending(answered))
 
 

@@ -18,7 +18,7 @@ from mapless_server.scenes import ANYWHERE
 from mapless_server.store import SceneAttributes
 
 from . import tracking
-from .query import Result, Tier
+from .query import CutReason, Result, Tier
 from .search import Search
 
 
@@ -81,12 +81,14 @@ class Verdicts:
             chosen = next((it for it in reversed(search.found) if it.answer.support is not None), chosen)
         result = self.result(search, chosen, search.materials[search.found.index(chosen)], verdict.outcome)
         ended = zip(search.attempts, search.tried, strict=True)
-        return replace(result, attempts=tuple(replace(it, is_chosen=tried == chosen.attempt) for it, tried in ended))
+        attempts = tuple(replace(it, is_chosen=tried == chosen.attempt) for it, tried in ended)
+        return replace(result, attempts=attempts, cuts=search.cuts)
 
-    def without_present(self, search: Search, outcome: str) -> Result:
+    def without_present(self, search: Search, outcome: str, reason: CutReason) -> Result:
         """The result without the present attempt, which ended so."""
         assert search.verdict is not None
-        search = search.ended(outcome, self.tier(search.attempt).features)
+        features = self.tier(search.attempt).features
+        search = search.ended(outcome, features).cut(search.rung, features, reason)
         answered = self.answer(search)
         rejection = answered.answer.outcome
         if isinstance(rejection, Rejection) and rejection.hint is not None:

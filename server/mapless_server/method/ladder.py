@@ -47,6 +47,8 @@ class Rung:
         untried: says in a rejection that it was not finished.
         change: makes the attempt from the one before, and the one of the best pose so far; None for none.
         is_possible: whether an attempt can be changed so.
+        is_cheap: whether it costs about as much as the first attempt, so that also those get it who have to wait for
+            others.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Rung:
     untried: str
     change: Callable[[Attempt, Attempt | None], Attempt]
     is_possible: Callable[[Attempt, Situation], bool]
+    is_cheap: bool = False
 
 
 STRENGTHENED = (
@@ -96,6 +99,7 @@ RUNGS = (
         "with wide matches",
         lambda before, _: before.but(matching=before.matching.widened, solver=Solver.POINTS),
         _on_points,
+        is_cheap=True,
     ),
     Rung(
         "lines",
@@ -106,6 +110,7 @@ RUNGS = (
         "from epipolar lines",
         lambda before, _: before.but(matching=before.matching.widened, solver=Solver.LINES),
         _on_points,
+        is_cheap=True,
     ),
     Rung(
         "one place",
@@ -116,6 +121,7 @@ RUNGS = (
         "with references of one of the places",
         lambda before, _: before.basis.but(where=Where.ONE_PLACE),
         lambda before, it: it.has_place,
+        is_cheap=True,
     ),
     Rung(
         "elsewhere",
@@ -126,6 +132,7 @@ RUNGS = (
         "with references of the whole scene",
         lambda before, _: before.basis.but(where=Where.ANYWHERE),
         lambda before, it: it.may_be_elsewhere,
+        is_cheap=True,
     ),
     Rung(
         "turned",

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from .failing import FAILING
 from .jobs import AnyJob, Flow, Refusal, Refused
 from .shares import Shares
 
@@ -139,6 +140,11 @@ class Ledger:
     def job_count(self, flow: Flow | None = None) -> int:
         """Number of jobs of one client, or of all, without those that are set aside."""
         return self._of(flow).in_order
+
+    def others_wait(self, flow: Flow) -> bool:
+        """Whether jobs of another caller, which does not fail, are admitted, without those that are set aside."""
+        others = (it for group, it in self._callers.items() if group != flow.group and group[1] != FAILING)
+        return any(it.in_order for it in others)
 
     def booked_s(self, lane: str, flow: Flow | None = None) -> float:
         """Computing time predicted for the jobs of one client, or of all."""

@@ -2,6 +2,7 @@
 
 from collections import Counter, OrderedDict, deque
 from collections.abc import Mapping
+from dataclasses import replace
 from statistics import median_low
 from typing import NamedTuple
 
@@ -138,3 +139,23 @@ class StageCosts:
         while is_done and stage.then:
             stage, kind = self._stages[stage.then], job.step.later_kind or kind
             self._model.observe(stage.name, kind, job.flow, None, now_s)
+
+
+class FirstSteps:
+    """The first step of each caller's last job in a stage, without its payload."""
+
+    def __init__(self) -> None:
+        self._steps: OrderedDict[tuple[tuple[str, str], str], AnyStep] = OrderedDict()
+
+    def remember(self, flow: Flow, step: AnyStep) -> None:
+        """Keeps the first step of a job."""
+        key = flow.group, step.stage
+        if (known := self._steps.get(key)) is None or known.kind != step.kind:
+            self._steps[key] = replace(step, payload=None)
+        self._steps.move_to_end(key)
+        if len(self._steps) > MAX_OF_CALLERS:
+            self._steps.popitem(last=False)
+
+    def last(self, flow: Flow, step: AnyStep) -> AnyStep:
+        """That of the caller's last job in the stage of a step; this step if there was none."""
+        return self._steps.get((flow.group, step.stage), step)

@@ -1,12 +1,14 @@
 """Callers whose last photographs all failed: together they queue as one more caller, and get only what is cheap."""
 
 from collections import OrderedDict
+from itertools import takewhile
 from typing import NamedTuple
 
 from .costs import MAX_OF_CALLERS
+from .expected import LATELY_S
 from .jobs import Flow
 
-FAILURES = 4
+FAILURES = 2
 """A caller fails if so many of its last photographs did, and none since was localized."""
 FORGOTTEN_S = 60.0
 """A caller that has asked nothing for so long is one like any other again."""
@@ -28,6 +30,8 @@ class Failing:
 
     def __init__(self) -> None:
         self._of_callers: OrderedDict[tuple[str, str], _Failures] = OrderedDict()
+        # When the others asked last, in this order.
+        self._asked_s: OrderedDict[tuple[str, str], float] = OrderedDict()
 
     def answered(self, flow: Flow, is_localized: bool, now_s: float) -> None:
         """Counts a photograph, or photographs that were localized together."""
@@ -38,6 +42,19 @@ class Failing:
         self._of_callers[flow.group] = _Failures(count + 1, now_s)
         if len(self._of_callers) > MAX_OF_CALLERS:
             self._of_callers.popitem(last=False)
+
+    def asked(self, flow: Flow, now_s: float) -> None:
+        """Notes that a client asks, as whom it is queued."""
+        if flow.caller != FAILING:
+            self._asked_s[flow.group] = now_s
+            self._asked_s.move_to_end(flow.group)
+            if len(self._asked_s) > MAX_OF_CALLERS:
+                self._asked_s.popitem(last=False)
+
+    def others_ask(self, flow: Flow, now_s: float) -> bool:
+        """Whether another caller, which did not fail, has asked lately."""
+        lately = takewhile(lambda it: now_s - it[1] <= LATELY_S, reversed(self._asked_s.items()))
+        return any(group != flow.group for group, _ in lately)
 
     def is_failing(self, flow: Flow, now_s: float) -> bool:
         """Whether a caller's last photographs all failed."""

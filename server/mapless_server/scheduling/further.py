@@ -73,7 +73,7 @@ class Further:
             return Choice(step, When.IN_ORDER if is_computed else When.NEVER, cost_s)
         before_s = self._before_s(job)
         for step, cost_s in costs:
-            if self._may_wait(job, cost_s, before_s, now_s):
+            if self._may_wait(job, cost_s, before_s, now_s, following.has_begun):
                 return Choice(step, When.ASIDE, cost_s)
         step, cost_s = min(costs, key=lambda it: it[1].total())
         # Those that cost more are never tried anyway: that could cost what the cheapest gives.
@@ -94,12 +94,17 @@ class Further:
             for name, lane in self._lanes.items()
         )
 
-    def _may_wait(self, job: AnyJob, cost_s: Counter[str], before_s: float, now_s: float) -> bool:
+    def _may_wait(
+        self, job: AnyJob, cost_s: Counter[str], before_s: float, now_s: float, has_begun: bool = False
+    ) -> bool:
         """Whether a step can be computed in time after so much else.
 
         It does not wait if jobs were refused lately: more come than is computed, so that its turn would hardly come.
-        The only job does, since it waits for nothing.
+        The only job does, since it waits for nothing. What has begun goes on if it alone is in time: what was spent on
+        it would be lost otherwise, and it waits aside whatever comes.
         """
+        if has_begun:
+            return now_s + cost_s.total() <= job.due_s
         if self._is_recent(self._refused_s, now_s) and len(self._ledger.jobs) > 1:
             return False
         return now_s + before_s + cost_s.total() <= job.due_s

@@ -165,11 +165,13 @@ class Next(Generic[PayloadT, ValueT]):
         steps: one of them is computed.
         fallback: what the job ends with if no step leads to a result in time.
         is_admitted: whether the job was admitted with these steps, which then wait with those of other jobs.
+        has_begun: whether they continue a further step that was computed, and go on though jobs are refused.
     """
 
     steps: tuple[Step[PayloadT], ...]
     fallback: Fallback[PayloadT, ValueT] | None = None
     is_admitted: bool = False
+    has_begun: bool = False
 
     def __post_init__(self) -> None:
         if not self.steps:
@@ -266,7 +268,7 @@ class Job(Generic[PayloadT, ValueT]):
     unusual_s: float = 0.0
     is_computed: bool = False
     timer_s: float = -math.inf
-    owner: Flow = Flow("", "")
+    owner: Flow = field(default_factory=lambda: Flow("", ""))
     _life: _Life = field(default_factory=_Life)
 
     @property

@@ -5,14 +5,13 @@ A state machine without threads, waiting or a clock: times are passed in, so tha
 
 import itertools
 import math
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 
 from .admission import Admission, Ledger, WorkQueueOptions
-from .costs import MAX_OF_CALLERS, CostModel, StageCosts
-from .expected import LATELY_S, Expected
+from .costs import CostModel, FirstSteps, StageCosts
+from .expected import Expected
 from .failing import FAILING, Failing
 from .fair_queue import FairQueue, FurtherQueue, further
 from .further import Further, When
@@ -76,7 +75,7 @@ class Scheduler:
         self._quota = quota
         self._stages = {stage.name: stage for stage in stages}
         self._stage_costs = StageCosts(self.costs, self._stages)
-        self._failing = Failing()
+        self.failing = Failing()
         self._shares = Shares()
         self._queues: dict[str, FairQueue[AnyJob]] = {stage.name: FairQueue(self._shares) for stage in stages}
         # Further steps of admitted jobs, which were not admitted with them.
@@ -89,7 +88,7 @@ class Scheduler:
             low_count = 0 if low is None else low.get(name, 0)
             self._lanes[name] = Lane(count, own, queues, aside, count, low_count, low_count)
         self._limits: dict[tuple[str, str], BatchLimit] = {}
-        self._first_steps: OrderedDict[tuple[tuple[str, str], str], AnyStep] = OrderedDict()
+        self._first_steps = FirstSteps()
         self._ledger = Ledger(self._shares)
         self._admission = Admission(options, lanes, self._ledger)
         self._further = Further(options, self._stages, self._lanes, self._stage_costs, self._ledger, self._admission)
@@ -121,30 +120,20 @@ class Scheduler:
         queue, aside = self._queues[stage], self._aside[stage]
         return StageLoad(len(queue) + len(aside), queue.cost_s, self._running[stage])
 
-    def answered(self, flow: Flow, is_localized: bool, now_s: float) -> None:
-        """Counts whether a caller's photograph was localized, see `Failing`."""
-        self._failing.answered(flow, is_localized, now_s)
-
-    def others_ask(self, flow: Flow, now_s: float) -> bool:
-        """Whether another caller, which does not fail, has asked lately."""
-        return any(
-            now_s - came_s <= LATELY_S and other.group != flow.group
-            for lane in self._lanes.values()
-            for other, _, came_s in lane.arrivals
-        )
-
-    def is_failing(self, flow: Flow, now_s: float) -> bool:
-        """Whether a caller's last photographs all failed."""
-        return self._failing.is_failing(flow, now_s)
+    def gets_cheap_steps(self, flow: Flow, now_s: float) -> bool:
+        """Whether a caller's last photographs all failed, while others ask whose photographs do not."""
+        is_failing = self.failing.is_failing(flow, now_s)
+        return is_failing and (self._ledger.others_wait(flow) or self.failing.others_ask(flow, now_s))
 
     def admit(self, job: AnyJob, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
         if job.flow.caller != FAILING:  # else it was refused before
             job.owner = job.flow
-        job.flow = self._failing.queued_as(job.owner, now_s)
+        job.flow = self.failing.queued_as(job.owner, now_s)
         cost_s = self._stage_costs.of(job.step, job.flow, now_s)
+        self.failing.asked(job.flow, now_s)
         if not job.continues:
-            self._remember(job.flow, job.step)
+            self._first_steps.remember(job.flow, job.step)
         with self._refusals_reported(job.flow, now_s):
             self._admission.check(job, cost_s, now_s)
             # The server's own jobs have no tenant and are free; a job that continues others is charged when it ends.
@@ -172,8 +161,8 @@ class Scheduler:
 
         That is a job as the caller's last one with this stage as its first, or with this step if there was none.
         """
-        flow = self._failing.queued_as(flow, now_s)
-        step = self._first_steps.get((flow.group, step.stage), step)
+        flow = self.failing.queued_as(flow, now_s)
+        step = self._first_steps.last(flow, step)
         with self._refusals_reported(flow, now_s):
             self._admission.check_queue(flow, self._stage_costs.of(step, flow, now_s))
 
@@ -326,15 +315,6 @@ class Scheduler:
                 self._further.refused(flow, now_s)
             self._observer.refused(refused.reason)
             raise
-
-    def _remember(self, flow: Flow, step: AnyStep) -> None:
-        """Keeps the first step of a caller's last job, without its payload, for `check_room`."""
-        key = flow.group, step.stage
-        if (known := self._first_steps.get(key)) is None or known.kind != step.kind:
-            self._first_steps[key] = replace(step, payload=None)
-        self._first_steps.move_to_end(key)
-        if len(self._first_steps) > MAX_OF_CALLERS:
-            self._first_steps.popitem(last=False)
 
     def _continue(self, job: AnyJob, result: AnyNext, now_s: float) -> None:
         """Queues a job for its next step, or ends it with its fallback; see `Next` and `Further`."""

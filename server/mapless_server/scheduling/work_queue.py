@@ -209,13 +209,12 @@ class WorkQueue:
     def answered(self, flow: Flow, is_localized: bool) -> None:
         """Counts whether a caller's photograph was localized, see `Failing`."""
         with self._lock:
-            self._scheduler.answered(flow, is_localized, time.monotonic())
+            self._scheduler.failing.answered(flow, is_localized, time.monotonic())
 
-    def is_failing_beside_others(self, flow: Flow) -> bool:
+    def gets_cheap_steps(self, flow: Flow) -> bool:
         """Whether a caller's last photographs all failed, while others ask whose photographs do not."""
-        now_s = time.monotonic()
         with self._lock:
-            return self._scheduler.is_failing(flow, now_s) and self._scheduler.others_ask(flow, now_s)
+            return self._scheduler.gets_cheap_steps(flow, time.monotonic())
 
     def forget_costs(self) -> None:
         """Forgets the observed computing times, because those of later jobs will differ."""

@@ -66,6 +66,8 @@ from mapless_server.store import LruCache, SceneAttributes, Store, codec
 
 Joined = TypeVar("Joined")
 
+_CALLER_FAILS = pb.LADDER_CUT_REASON_CALLER_FAILS
+
 RETRIEVAL = "retrieval"
 """The stage in which references are chosen."""
 _CACHE_BYTES = 512 * 2**20
@@ -250,13 +252,16 @@ class _Recomputing:
         extractor, part = self._tiers[0].extractor, self._parts[field]
         recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._described)
         views = QueryViews(query.photo, self.options.image_limits)
-        return Job(Flow("", ""), Search.begin(query, recorded, views, math.inf).first_step, math.inf, 0)
+        cuts = [(it.rung, it.features) for it in self._then[field].ladder_cuts if it.reason == _CALLER_FAILS]
+        search = Search.begin(query, recorded, views, math.inf)
+        search = replace(search, is_cut_at=lambda rung, features: (rung, features) in cuts)
+        return Job(Flow("", ""), search.first_step, math.inf, 0)
 
     async def run(self, job: SearchJob) -> Result:
         search = job.step.payload
-        attempts = self._then[search.query.photo.field].attempts
+        then = self._then[search.query.photo.field]
         stages = QueryStages(self._tiers, self.options.doubt, self._method)
-        return await asyncio.to_thread(_compute, stages, job, partial(followed, attempts, self._tiers))
+        return await asyncio.to_thread(_compute, stages, job, partial(followed, then, self._tiers))
 
     def answered(self, caller: Caller, is_localized: bool) -> None:
         pass
@@ -290,20 +295,27 @@ def _compute(
             return result.fallback.make(job.step.payload).value
 
 
-def followed(
-    then: Sequence[pb.Attempt], tiers: Sequence[Tier], following: Next[Search, Result]
-) -> tuple[SearchStep, bool]:
-    """The step of the attempt that came next in a captured answer, and whether that had a result.
+def followed(then: pb.Diagnostics, tiers: Sequence[Tier], following: Next[Search, Result]) -> tuple[SearchStep, bool]:
+    """The step that came next in a captured answer, and whether its attempt had a result.
 
     Attempts that are not made any more are passed over. The first step where the captured answer had no further
-    attempt, as those of servers that did not list them.
+    attempt, as those of servers that did not list them. References that the network did not match then are not matched.
     """
-    for captured in then[len(following.steps[0].payload.attempts) :]:
-        for step in following.steps:
-            search = step.payload
-            if (search.rung, tiers[search.attempt.features].features) == (captured.rung, captured.features):
-                return step, captured.outcome not in ("unfinished", "failed", "out_of_memory")
+    for captured in then.attempts[len(following.steps[0].payload.attempts) :]:
+        steps = [it for it in following.steps if _named(it, tiers) == (captured.rung, captured.features)]
+        if steps:
+            without = {it.unmatched_reference_count for it in then.ladder_cuts if _is_of(it, captured)}
+            last = next((it for it in steps[1:] if it.payload.cuts[-1].unmatched in without), steps[0])
+            return last, captured.outcome not in ("unfinished", "failed", "out_of_memory")
     return following.steps[0], True
+
+
+def _named(step: SearchStep, tiers: Sequence[Tier]) -> tuple[str, str]:
+    return step.payload.rung, tiers[step.payload.attempt.features].features
+
+
+def _is_of(cut: pb.LadderCut, attempt: pb.Attempt) -> bool:
+    return (cut.rung, cut.features) == (attempt.rung, attempt.features) and cut.unmatched_reference_count > 0
 
 
 def _is_cut_short(request: Any, then: Response) -> bool:

@@ -205,6 +205,12 @@ def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagn
         attempt = message.attempts.add(rung=it.rung, features=it.features, outcome=it.outcome, chosen=it.is_chosen)
         attempt.duration.FromNanoseconds(round(1e9 * it.seconds))
         attempt.processor_duration.FromNanoseconds(round(1e9 * it.processor_s))
+    for cut in result.cuts:
+        reason = enum_to_message(cut.reason, pb.LadderCutReason)
+        unmatched = cut.unmatched
+        message.ladder_cuts.add(
+            rung=cut.rung, features=cut.features, reason=reason, unmatched_reference_count=unmatched
+        )
     return message
 
 
