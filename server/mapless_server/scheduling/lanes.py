@@ -23,7 +23,7 @@ class Lane:
         low_threads: number of threads besides, of low priority, which compute what waits aside; 0 if the others do.
         low_free: number of idle ones of them.
         passed_over: batches since the first stage that has waiting jobs was served.
-        busy_s: sum of the threads' computing times so far.
+        busy_s: sum of the threads' computing times so far, without those of low priority.
         long: numbers of the batches that the threads compute of which a step is predicted to take more than a quantum,
             and whether it is one that waited aside.
         low: numbers of the batches that threads of low priority compute.
@@ -58,14 +58,15 @@ class Lane:
         else:
             self.free -= 1
 
-    def finish(self, batch: int) -> None:
-        """Undoes `begin`."""
+    def finish(self, batch: int, seconds: float) -> None:
+        """Undoes `begin`, after so long."""
         self.long.pop(batch, None)
         if batch in self.low:
             self.low.remove(batch)
             self.low_free += 1
         else:
             self.free += 1
+            self.busy_s += seconds
 
     def first_aside(self) -> Stage | None:
         """The stage of the job aside whose turn it is among them; None if none waits."""

@@ -122,8 +122,8 @@ class Scheduler:
 
     def gets_cheap_steps(self, flow: Flow, now_s: float) -> bool:
         """Whether a caller's last photographs all failed, while others ask whose photographs do not."""
-        is_failing = self.failing.is_failing(flow, now_s)
-        return is_failing and (self._ledger.others_wait(flow) or self.failing.others_ask(flow, now_s))
+        others_ask = self._ledger.others_wait(flow) or self.failing.others_ask(flow, now_s)
+        return others_ask and self.failing.is_failing(flow, now_s)
 
     def admit(self, job: AnyJob, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""
@@ -238,8 +238,7 @@ class Scheduler:
         """
         stage, seconds = batch.stage, now_s - batch.start_s
         lane = self._lanes[stage.lane]
-        lane.finish(batch.number)
-        lane.busy_s += seconds
+        lane.finish(batch.number, seconds)
         self._running[stage.name] -= len(batch.jobs)
         bucket = batch.jobs[0].step.bucket
         self._observer.computed(stage.name, bucket, len(batch.jobs), seconds)
@@ -342,10 +341,9 @@ class Scheduler:
         if job.flow.caller == FAILING:
             self._enqueue_aside(job, cost_s, job.due_s, now_s)
             return
-        stage = self._stages[job.step.stage]
         job.waits_since_s = now_s
         self._queue_of(job).push(job, job.flow, cost_s)
-        self._lanes[stage.lane].arrivals.append((job.flow, cost_s, now_s))
+        self._lanes[self._stages[job.step.stage].lane].arrivals.append((job.flow, cost_s, now_s))
         self._timers.set(job)
 
     def _enqueue_aside(self, job: AnyJob, cost_s: float, until_s: float, now_s: float) -> None:
