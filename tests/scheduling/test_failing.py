@@ -1,10 +1,12 @@
-"""Callers whose last photographs all failed: whom they wait for, and when they are like others again."""
+"""Callers whose last photographs failed: whom they wait for, and when they are like others again."""
 
+import numpy as np
 import pytest
 from support.toy_scheduler import FAR_S, Toy, run_through
 
 from mapless_server.scheduling import Done, Fallback, Flow, Next, Refused, Step
 from mapless_server.scheduling.failing import FAILURES, FORGOTTEN_S
+from research.lost_robots import beside
 
 LOST, OTHER = Flow("t", "lost"), Flow("t", "other")
 
@@ -19,21 +21,32 @@ def lost(toy: Toy, *callers: Flow) -> None:
 @pytest.mark.parametrize(
     ("answers", "wait_s", "is_failing"),
     [
-        ([False] * FAILURES, 0.0, True),
-        ([False] * (FAILURES - 1), 0.0, False),
+        ([False], 0.0, True),
         ([False] * 10 + [True], 0.0, False),
-        ([False] * (FAILURES - 1) + [True] + [False] * (FAILURES - 1), 0.0, False),
+        ([True] * 10 + [False], 0.0, False),
+        ([True] * 10 + [False] * 3, 0.0, True),
+        ([True, False] * 10, 0.0, False),
         ([False] * 10, FORGOTTEN_S + 1, False),
     ],
-    ids=["all failed", "too few", "then localized", "one between", "long ago"],
+    ids=["the only one failed", "then localized", "one failed", "became lost", "half of them", "long ago"],
 )
-def test_a_caller_fails_whose_last_photographs_all_did(answers: list[bool], wait_s: float, is_failing: bool) -> None:
+def test_a_caller_fails_whose_last_photographs_did(answers: list[bool], wait_s: float, is_failing: bool) -> None:
+    """Whatever its clients call themselves."""
     toy = Toy()
     for it in answers:
         toy.scheduler.failing.answered(LOST, it, toy.now_s)
     assert toy.scheduler.failing.is_failing(LOST, toy.now_s + wait_s) == is_failing
     assert toy.scheduler.failing.is_failing(LOST._replace(client="another"), toy.now_s + wait_s) == is_failing
     assert not toy.scheduler.failing.is_failing(OTHER, toy.now_s)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_lost_robots_leave_a_fleet_its_times(seed: int) -> None:
+    """Eight that ask without end beside three that are localized, each with a token."""
+    alone, lost = beside(0, seed=seed), beside(8, seed=seed)
+    p99_s = [float(np.quantile(it.seconds, 0.99, method="inverted_cdf")) for it in (alone, lost)]
+    assert len(lost.seconds) == len(alone.seconds)
+    assert p99_s[1] <= 1.5 * p99_s[0]
 
 
 def test_many_failing_callers_leave_others_their_turns() -> None:

@@ -123,7 +123,7 @@ class Scheduler:
     def gets_cheap_steps(self, flow: Flow, now_s: float) -> bool:
         """Whether a caller's last photographs all failed, while others ask whose photographs do not."""
         others_ask = self._ledger.others_wait(flow) or self.failing.others_ask(flow, now_s)
-        return others_ask and self.failing.is_failing(flow, now_s)
+        return others_ask and self.failing.is_to_be_cut(flow, now_s)
 
     def admit(self, job: AnyJob, now_s: float) -> None:
         """Admits a job, which then ends exactly once; raises Refused without any change."""

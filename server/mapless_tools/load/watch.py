@@ -292,24 +292,24 @@ def priority_over(process_id: int) -> Iterator[None]:
     Real callers are on other machines; here, a generator that waits for a core would count its own waiting as the
     server's. If permitted, this process raises its own priority; else it lowers the other's, below that of all others.
     """
-    own_id, own = os.getpid(), os.getpriority(os.PRIO_PROCESS, 0)
+    own_id = os.getpid()
     try:
-        _set_niceness(own_id, own - NICENESS_STEP)
+        _add_niceness(own_id, -NICENESS_STEP)
     except PermissionError:
-        _set_niceness(process_id, os.getpriority(os.PRIO_PROCESS, process_id) + NICENESS_STEP)
+        _add_niceness(process_id, NICENESS_STEP)
         yield
         return
     try:
         yield
     finally:
-        _set_niceness(own_id, own)
+        _add_niceness(own_id, NICENESS_STEP)
 
 
-def _set_niceness(process_id: int, niceness: int) -> None:
-    """Sets the niceness of all threads; threads that they start later inherit it."""
-    for thread in os.listdir(f"/proc/{process_id}/task"):
+def _add_niceness(process_id: int, added: int) -> None:
+    """Changes the niceness of all threads, of which some have a higher one; those that they start later inherit it."""
+    for thread in map(int, os.listdir(f"/proc/{process_id}/task")):
         with suppress(ProcessLookupError):  # it has just ended
-            os.setpriority(os.PRIO_PROCESS, int(thread), niceness)
+            os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + added)
 
 
 def _unique_mib(folder: Path) -> float:

@@ -19,7 +19,7 @@ MODULES = {
     ),
     "stationary_auto": ("stationary-overlays-auto",),
     "one_place": ("same-place", "clearly-more"),
-    "fairness": ("queue-credit", "queue-lately", "queue-client-share"),
+    "fairness": ("queue-credit", "queue-lately", "queue-client-share", "queue-failing", "queue-shorter"),
     "handshake": ("handshake",),
 }
 """The keys that each module measures, by `measure(key, scenes)`, which returns the question and its rows."""

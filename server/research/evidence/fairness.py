@@ -6,9 +6,10 @@ from types import ModuleType
 
 import numpy as np
 
-from mapless_server.scheduling import WorkQueueOptions, admission, expected, shares
+from mapless_server.scheduling import WorkQueueOptions, admission, expected, failing, shares
 from mapless_server.scheduling.shares import MAX_IDLE
 
+from ..lost_robots import FLEET_STEPS_S, SharedCores, beside
 from ..neighbours import (
     ATTEMPT_S,
     ATTEMPTS,
@@ -27,6 +28,13 @@ from ..neighbours import (
 from .page import Question, Row
 
 SEEDS = 3
+_LOST = (
+    f"`research.lost_robots`: the server's own queue on a virtual clock, 2 cores, 2 threads and 2 of low priority, "
+    f"120 s, {SEEDS} seeds. Three robots, each with a token, ask at random times, 2.2 a second together (0.31 s each); "
+    "beside them eight lost robots ask without end, each with a token, photographs of another place (0.6 s, and "
+    "further steps of 8.7 s). Median and 99th percentile of the fleet's times, for each seed alone and beside the lost "
+    "ones, and how many of its calls were refused."
+)
 _FLEET = (
     f"`research.neighbours`: the server's own queue on a virtual clock, {THREADS} threads, {SECONDS:g} s, {SEEDS} "
     f"seeds, the worst of which counts. A fleet of one and of four robots asks at random times for {100 * SHARE:g} "
@@ -126,6 +134,30 @@ QUESTIONS = {
         ),
         _lately,
     ),
+    "queue-failing": (
+        Question(
+            "queue-failing",
+            "mapless_server.scheduling.failing:MEMORY",
+            "A caller waits for the others if its last photograph failed, and most of its last ones. Of how many?",
+            _LOST,
+            "4. All keep the fleet's times: a new caller that is lost waits from its second photograph on. With 1 "
+            "a token of many robots would wait after each photograph that fails; with 4 half of them may fail. With "
+            "more, a robot that becomes lost delays the others for longer.",
+        ),
+        lambda: _lost(failing, "MEMORY", (1, 2, 4, 8)),
+    ),
+    "queue-shorter": (
+        Question(
+            "queue-shorter",
+            "mapless_server.scheduling.expected:SHORTER",
+            "Steps of a caller leave one thread to those who come before it and need less time. How much less?",
+            _LOST + " Here the fleet's photographs are a single step of 0.33 s.",
+            "1.25. Without a bound (0) a robot's step leaves a thread idle for another robot of its fleet, which takes "
+            "as long, and the fleet waits for itself. Predictions of equal steps differ by some per cent, so that 1 is "
+            "too little where they vary; beyond 1.25 nothing is gained.",
+        ),
+        lambda: _lost(expected, "SHORTER", (0.0, 1.0, 1.25, 2.0), (0.33,)),
+    ),
     "queue-client-share": (
         Question(
             "queue-client-share",
@@ -143,6 +175,24 @@ QUESTIONS = {
         _client_share,
     ),
 }
+
+
+def _times(lost: SharedCores) -> str:
+    p50_s, p99_s = np.quantile(lost.seconds, (0.5, 0.99), method="inverted_cdf")
+    return f"{p50_s:.2f}, {p99_s:.2f} s"
+
+
+def _lost(
+    module: ModuleType, name: str, values: tuple[float, ...], steps_s: tuple[float, ...] = FLEET_STEPS_S
+) -> Iterator[Row]:
+    for value in _each(module, name, values):
+        row = dict[str, object](value=f"{value:g}")
+        for seed in range(SEEDS):
+            for title, robots in (("alone", 0), ("beside", 8)):
+                server = beside(robots, seed=seed, fleet_steps_s=steps_s)
+                row[f"{seed}, {title}"] = _times(server)
+                row["refused"] = server.refused + int(str(row.get("refused", 0)))
+        yield row
 
 
 def measure(key: str, scenes: object) -> tuple[Question, Iterator[Row]]:
