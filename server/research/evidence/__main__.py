@@ -21,6 +21,7 @@ MODULES = {
     "one_place": ("same-place", "clearly-more"),
     "fairness": ("queue-credit", "queue-lately", "queue-client-share", "queue-failing", "queue-shorter"),
     "handshake": ("handshake",),
+    "accused": ("accusation-chance",),
 }
 """The keys that each module measures, by `measure(key, scenes)`, which returns the question and its rows."""
 

@@ -1,7 +1,7 @@
 """Errors of a photograph's intrinsics: their derivatives, the evidence of them, and what they add to a covariance."""
 
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 from mapless.geometry import Array, Camera
 from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_server.method.bundle.adjust import adjust_pose
-from mapless_server.method.bundle.estimate import PoseEstimate, PoseStage, Support
+from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage, Support
 from mapless_server.method.bundle.intrinsics import (
     IntrinsicsEvidence,
     corrected,
@@ -23,7 +23,9 @@ from mapless_server.method.bundle.intrinsics import (
 from mapless_server.method.bundle.pose_problem import AdjustInput, AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.features.views import undistort_pixels
+from mapless_server.method.judge.answer import Answer
 from mapless_server.method.judge.cameras import intrinsics_checks, wrong_camera, wrong_intrinsics
+from mapless_server.method.judge.hints import hinted
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.structure.model import PointMatches
 
@@ -314,11 +316,30 @@ def rejection_of(
     is_estimated: bool = False,
     lens: Distortion | None = None,
     given_lens: Distortion | None = None,
-    is_weak: bool = False,
+    count: int | None = None,
 ) -> tuple[Rejection | None, Camera]:
+    """Of `support_of`, and the true camera."""
+    support, true = support_of(
+        focal, principal, focal_x, outliers, sigma, doubted, is_estimated, lens, given_lens, count
+    )
+    return wrong_camera(support, "a"), true
+
+
+def support_of(
+    focal: float = 1.0,
+    principal: float = 1.0,
+    focal_x: float = 1.0,
+    outliers: float = 0.0,
+    sigma: float | None = None,
+    doubted: float = 3.1,
+    is_estimated: bool = False,
+    lens: Distortion | None = None,
+    given_lens: Distortion | None = None,
+    count: int | None = None,
+) -> tuple[PosedSupport, Camera]:
     """Of a photograph with intrinsics that are wrong by these factors, and seem so by `doubted` standard deviations.
 
-    They may be estimated with the pose, and the lens may be another than the given one.
+    They may be estimated with the pose, and the lens may be another than the given one. It has so many matches.
     """
     scene = make_scene(random_for("wrong camera"))
     random, true = random_for("outliers"), scene.query.camera
@@ -348,8 +369,12 @@ def rejection_of(
     evidence = IntrinsicsEvidence(given, given, value, usual, usual, np.zeros((4, 4)), np.zeros((6, 4)), zero)
     nothing = tuple(np.empty((0, 2), np.int32) for _ in scene.references)
     estimate = replace(estimate, intrinsics=evidence)
+    if count is not None:
+        rows = np.linspace(0, len(matches) - 1, count).astype(int)
+        matches = matches.select(rows)
+        estimate = replace(estimate, inliers=estimate.inliers[rows], errors_px=estimate.errors_px[rows])
     support = Support(query, scene.references, structure, matches, np.zeros(3), nothing, stated).posed(estimate)
-    return wrong_camera(support, "a", is_doubted=is_weak), true
+    return support, true
 
 
 @pytest.mark.parametrize(
@@ -431,13 +456,33 @@ def test_intrinsics_estimated_with_the_pose_are_its_own(is_estimated: bool, is_n
     assert (rejection is not None) == is_named
 
 
-@pytest.mark.parametrize(("focal", "k1", "is_evidence"), [(1.0, -0.1, False), (2.0, 0.0, True)])
-def test_a_weak_pose_is_evidence_only_if_very_clear(focal: float, k1: float, is_evidence: bool) -> None:
-    """Otherwise stronger features are tried, which checks of intrinsics would prevent."""
-    rejection, _ = rejection_of(focal=focal, lens=RadialTangential(k1), is_weak=True)
+@pytest.mark.parametrize(("count", "is_accused"), [(22, False), (30, False), (300, True)])
+def test_few_matches_accuse_no_camera(count: int, is_accused: bool) -> None:
+    """Of twice the true focal length: the pose of one that fits far more of 22 matches is rejected, its camera not."""
+    rejection, _ = rejection_of(focal=2.0, count=count)
     assert rejection
-    assert "all together fit one of" in rejection.message
-    assert bool(rejection.intrinsics_checks) == is_evidence
+    assert bool(rejection.intrinsics_checks) is is_accused
+    assert (rejection.hint is not None) is is_accused
+    assert ("focal" in rejection.message) is is_accused
+
+
+@pytest.mark.parametrize(("count", "focal", "is_named"), [(None, 2.0, True), (30, 2.0, False), (None, 1.0, False)])
+def test_a_rejection_without_a_pose_names_its_camera_likewise(count: int | None, focal: float, is_named: bool) -> None:
+    support, true = support_of(focal=focal, count=count)
+    unposed = Support(**{it.name: getattr(support, it.name) for it in fields(Support)})
+    rejection = Rejection(RejectionReason.PNP_FAILED, "planted", tried=len(support.matches))
+    shared = tuple(120 for _ in support.references)
+    answer = Answer(rejection, reference_match_counts=shared, support=unposed)
+    outcome = hinted(answer, support.query, support.references).outcome
+    assert isinstance(outcome, Rejection)
+    assert outcome.hint is not None
+    assert (outcome.hint.advice is Advice.CHECK_CALIBRATION) is is_named
+    assert ("Check the photograph's focal length" in outcome.hint.message) is is_named
+    if is_named:
+        (check,) = outcome.intrinsics_checks
+        assert check.estimated == pytest.approx(true.focal_x_px, rel=0.1)
+    else:
+        assert outcome.intrinsics_checks == ()
 
 
 def test_a_camera_that_nothing_doubts_is_not_compared() -> None:

@@ -230,7 +230,7 @@ def test_the_tracking_is_checked_where_photographs_are_localized_alone() -> None
     assert str(found.hint) == str(replace(CHECK_TRACKING, best_reference=NAMES[0]))
     of_rig = hinted_group(Rejection(RejectionReason.GATE, "planted"), images).hint
     assert of_rig is not None
-    assert "intrinsics" in of_rig.message
+    assert "poses of the cameras" in of_rig.message
 
 
 SCENE = make_scene(random_for("group hints"))

@@ -29,7 +29,7 @@ from mapless_server.method.judge.judge import JudgeOptions, judge, trust_of
 from mapless_server.method.optim.optimize import pose_jacobian
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pose.pnp import LOSS_SCALE_PX, PnpOptions, solve_pose
-from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
+from mapless_server.method.rejection import Rejection, RejectionReason
 
 OPTIONS = JudgeOptions()
 COVERAGE = LocalizeOptions().coverage
@@ -107,19 +107,6 @@ def test_poses_with_trust_below_1_minus_coverage_are_rejected() -> None:
         f"its trust of {np.floor(1000 * trust) / 1000:g} is below the {1 - too_little:.6g} "
     )
     assert "matches agree" in refused.message
-
-
-def test_a_doubted_pose_keeps_no_features_from_being_tried(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The comparison with other cameras is given which poses have too little evidence."""
-    check = IntrinsicsCheck(IntrinsicsParameter.FOCAL_LENGTH, 500.0, 600.0, 10.0, 1.5, True, False)
-    named = Rejection(RejectionReason.GATE, "focal_x_px 600 instead of 500", intrinsics_checks=(check,))
-    unchecked = replace(named, intrinsics_checks=())
-    compared = "mapless_server.method.judge.judge.wrong_camera"
-    monkeypatch.setattr(compared, lambda *given: unchecked if given[2] else named)
-    support = support_of()
-    trust, rejection = verdict(support, 1.0)
-    assert rejection == named
-    assert verdict(support, 1 - trust - 1e-6)[1] == unchecked
 
 
 @pytest.mark.parametrize(("share", "is_accepted"), [(0.079, True), (0.081, False), (1.0, False)])

@@ -257,7 +257,7 @@ def test_intrinsics_of_another_image_size_are_named(factor: float) -> None:
         assert rejection is None
         return
     assert rejection is not None
-    assert rejection.message.startswith("its matches agree as well with a pose of focal_x_px")
+    assert rejection.message.startswith("its matches agree better with a pose of focal_x_px")
     found = {it.parameter: it.estimated for it in rejection.intrinsics_checks}
     assert found[IntrinsicsParameter.FOCAL_LENGTH] == pytest.approx(CAMERA.focal_x_px, rel=0.01)
     assert found[IntrinsicsParameter.PRINCIPAL_X] == pytest.approx((CAMERA.width_px - 1) / 2)

@@ -27,6 +27,7 @@ from mapless_server.bounds import check_bounds
 
 from ..features.views import View, undistort_pixels
 from .priors import IntrinsicsSigma
+from .significance import HEAVY_TAIL, least_sigmas
 
 PRINCIPAL = (1, 2)
 """Which of the four errors are those of the principal point."""
@@ -41,13 +42,14 @@ class ContradictionOptions:
     """Options that define when a photograph contradicts a parameter of its intrinsics.
 
     Attributes:
-        sigmas: it is off by more standard deviations of the given and the estimated value together.
+        sigmas: it is off by more standard deviations of the given and the estimated value together; by default by so
+            many that it is significant.
         focal_share, principal_share, k1: standard deviations (of the focal length and the width, as shares) above
             which a photograph does not determine a parameter: noise in the depth of a flat wall's points looks like
             relief of the wall.
     """
 
-    sigmas: float = 6.75
+    sigmas: float = HEAVY_TAIL * least_sigmas(tested=4)
     focal_share: float = 0.02
     principal_share: float = 0.02
     k1: float = 0.05

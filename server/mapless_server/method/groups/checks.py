@@ -184,8 +184,8 @@ def _advice(reason: RejectionReason, matches: int, image_count: int) -> tuple[Ad
     if matches >= MANY_MATCHES:
         return (
             Advice.CHECK_CALIBRATION,
-            "Check the photographs' intrinsics, the poses of the cameras to one another, and the references' poses: "
-            f"{shared}, but all together agree on no pose.",
+            "Check the poses of the cameras to one another, that all photographs were taken at one moment, and the "
+            f"references' poses: {shared}, but all together agree on no pose.",
         )
     return (
         Advice.LOOK_AT_REFERENCE,

@@ -11,6 +11,10 @@ a part of the matches, at similar depths or near the centre, and these do not co
 agree with one pose of a camera that is nearer to the true one. So poses are computed with other focal lengths, other
 values of k1, without the lens, and, where these are unusual, with the principal point in the centre and with square
 pixels; the score of `pose.relative` compares them, by points and by matches without points together.
+
+A camera is accused only if that is significant (`bundle.significance`): if the keypoints that score higher with another
+camera outweigh those that score lower by more than chance. A pose that other cameras explain better is rejected also
+where it is not significant, for lack of evidence.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,12 +26,14 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Distortion, Fisheye
 
-from ..bundle.estimate import PosedSupport
+from ..bundle.estimate import PosedSupport, Support
 from ..bundle.intrinsics import ContradictionOptions, IntrinsicsEvidence, corrected, read_as
 from ..bundle.priors import IntrinsicsSigma
+from ..bundle.significance import is_significant, sigmas_of_gains
 from ..features.views import View
+from ..pose import pnp
 from ..pose.pnp import PnpOptions, ransac
-from ..pose.relative import Evidence, RelativePoseOptions, find_pose, score
+from ..pose.relative import Evidence, RelativePoseOptions, find_pose, scores_by_keypoint
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 
@@ -115,12 +121,9 @@ DOUBTED_SIGMAS, UNDETERMINED_FOCAL, UNDETERMINED_K1 = 3.0, 0.02, 0.05
 length (as a share) or k1 more uncertain than this."""
 
 MIN_GAIN, MANY_MATCHES, LARGE_SHARE, MIN_GAIN_ELSE = 1.1, 100, 0.45, 1.2
-"""The camera is wrong if a pose of another one scores this many times as high, where there are many matches with points
+"""A pose is rejected if one of another camera scores this many times as high, where there are many matches with points
 and no large share of them agrees with the pose; else if it scores 1.2 times as high. A pose that a large share agrees
 with is as right as its radii say, though its camera be a little wrong."""
-
-CLEAR_GAIN = 2.0
-"""From here on that of a pose with too little evidence is evidence against its camera, too."""
 
 MIN_MATCHES, MAX_LINES = 20, 1500
 """Fewer matches with points do not decide. Of more matches with references, every second keypoint, or fewer, is
@@ -161,28 +164,41 @@ class _Compared:
     They are of every `step`-th keypoint, and so are the views: reading these with other lenses takes long.
     """
 
-    support: PosedSupport
+    support: Support
+    by_lines: bool
     step: int
     lines: TwoViewMatches
     x_in_world: Array
     keypoint: NDArray[np.intp]
 
     @staticmethod
-    def of(support: PosedSupport) -> "_Compared":
+    def of(support: Support, by_lines: bool) -> "_Compared":
         matches, lines = support.matches, TwoViewMatches.of(support.query, support.references, support.query_matches)
         step = 1 + len(lines) // MAX_LINES
         used = np.flatnonzero(~matches.guided & (matches.keypoint % step == 0))
         points = support.structure.x_in_world[matches.point[used]]
         lines = lines[lines.keypoint % step == 0]
         lines = replace(lines, keypoint=lines.keypoint // step)
-        return _Compared(support, step, lines, points, matches.keypoint[used] // step)
+        return _Compared(support, by_lines, step, lines, points, matches.keypoint[used] // step)
 
     def thinned(self, view: View) -> View:
         """A view of the photograph with every `step`-th keypoint."""
         return replace(view, features=view.features.every(self.step))
 
-    def score_of(self, view: View, pose: RigidTransform | None = None) -> float:
-        """The score of a pose, by default of the best one that is found, of the photograph read as a thinned view."""
+    def own(self, given: Camera) -> "_Scored":
+        """The given camera with the scores of its best pose."""
+        query, found = self.support.query, list[_Scored]()
+        if isinstance(self.support, PosedSupport):
+            estimate = self.support.estimate
+            # The estimate's own intrinsics are those that were estimated with it, within what the caller allows.
+            view = self.thinned(estimate.view or query)
+            found.append(_Scored(given, self.scores_of(view, estimate.world_from_camera)))
+        if not self.by_lines:
+            found.append(_Scored(given, self.scores_of(self.thinned(query))))
+        return max(found, key=lambda it: it.total)
+
+    def scores_of(self, view: View, pose: RigidTransform | None = None) -> Array:
+        """The score by keypoint (F,) of a pose, by default of the best one that is found, of a thinned view."""
         is_seen = np.asarray(np.isfinite(view.features.keypoints).all(axis=1))
         points, keypoint, lines = self.x_in_world, self.keypoint, self.lines.read_as(view)
         if not is_seen.all():
@@ -192,59 +208,116 @@ class _Compared:
                 lines[is_seen[lines.keypoint]],
             )
         all_matches = Evidence(view, self.support.references, lines, points, keypoint)
-        if pose is None and self.support.two_view is not None:
+        if pose is None and self.by_lines:
             pose = find_pose(all_matches, LINES)
-        elif pose is None:
+        elif pose is None and len(points) >= pnp.MIN_MATCHES:  # through a strong lens few may be seen
             pose = ransac(all_matches.points, None, PNP)
-        return 0.0 if pose is None else score(all_matches, pose)
+        return np.zeros(len(view.features)) if pose is None else scores_by_keypoint(all_matches, pose)
 
-    def scored(self, camera: Camera) -> tuple[float, Camera]:
-        """A camera with its score, comparable with that of the given camera's pose."""
+    def scored(self, camera: Camera) -> "_Scored":
+        """A camera with its scores, comparable with those of the given camera's pose."""
         query = self.support.query
-        value = self.score_of(read_as(self.thinned(query), camera))
+        scores = self.scores_of(read_as(self.thinned(query), camera))
         # Without points a wrong lens can reach the right camera's score more nearly than a wrong focal length.
-        is_bent = self.support.two_view is not None and camera.distortion != query.distortion
-        return value / MIN_GAIN if is_bent else value, camera
+        is_bent = self.by_lines and camera.distortion != query.distortion
+        return _Scored(camera, scores / MIN_GAIN if is_bent else scores)
 
 
-def wrong_camera(support: PosedSupport, best_reference: str, is_doubted: bool = False) -> Rejection | None:
-    """A rejection that names what is wrong and the better value, if a pose of another camera scores clearly higher.
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """A camera and the scores (F,) of its best pose by keypoint."""
 
-    A pose that rests on matches without points is compared whatever the linear check says, with few cameras by a brief
-    search. For a pose that is doubted for lack of evidence the rejection has no checks, which would keep stronger
-    features from being tried, unless it is very clear.
+    camera: Camera
+    scores: Array
+
+    @property
+    def total(self) -> float:
+        return float(self.scores.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The given camera and the best of the others.
+
+    Attributes:
+        gain: ratio of their scores.
+        sigmas, tested: what the other gains, keypoint by keypoint, in standard deviations; and how many were compared.
+        checks: the parameters in which the two differ, in conflict.
+        lens: of the given camera.
     """
-    query, evidence, by_lines = support.query, support.estimate.intrinsics, support.two_view is not None
-    count = int((~support.matches.guided).sum())
-    if not by_lines and (count < MIN_MATCHES or evidence is None or not _is_doubtful(evidence)):
+
+    gain: float
+    sigmas: float
+    tested: int
+    checks: tuple[IntrinsicsCheck, ...]
+    lens: Distortion | None
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the given camera is accused."""
+        return is_significant(self.sigmas, self.tested)
+
+    @property
+    def named(self) -> str:
+        """The other camera, in words."""
+        return ", ".join(map(_difference, self.checks))
+
+    @property
+    def advice(self) -> str:
+        """The parameters to check, in words."""
+        return advice_for(self.lens, self.checks)
+
+
+def compare_cameras(support: Support) -> Comparison | None:
+    """Compares the photograph's camera with others by all of its matches; None if there are too few, or no others."""
+    by_lines = isinstance(support, PosedSupport) and support.two_view is not None
+    if not by_lines and int((~support.matches.guided).sum()) < MIN_MATCHES:
         return None
-    steps = BY_LINES if by_lines else BY_POINTS
+    query, steps = support.query, BY_LINES if by_lines else BY_POINTS
     prior_sigma = (support.intrinsics_sigma or IntrinsicsSigma()).of(query.camera)
     given = replace(query.camera, distortion=query.distortion)
     others = list(_other_cameras(given, prior_sigma, steps))
     if not others:
         return None
-    compared = _Compared.of(support)
-    best = max(map(compared.scored, others), key=lambda it: it[0])
-    # The estimate's own intrinsics are those that were estimated with it, within what the caller allows.
-    given_view = compared.thinned(support.estimate.view or query)
-    own, least = compared.score_of(given_view, support.estimate.world_from_camera), 1.0
+    compared = _Compared.of(support, by_lines)
+    best, tested = max(map(compared.scored, others), key=lambda it: it.total), len(others)
+    own = compared.own(given)
     if not by_lines:
-        is_clear = count >= MANY_MATCHES and support.estimate.inliers.mean() < LARGE_SHARE
-        own, least = max(own, compared.score_of(compared.thinned(query))), MIN_GAIN if is_clear else MIN_GAIN_ELSE
-        best = max([best, *map(compared.scored, _between(given, best[1], steps))], key=lambda it: it[0])
-    if best[0] < least * own:
-        return None
+        between = _between(given, best.camera, steps)
+        best, tested = max([best, *map(compared.scored, between)], key=lambda it: it.total), tested + len(between)
     sent = query.photograph.camera if query.photograph else given
-    checks = _differences(sent, prior_sigma, given, best[1], steps)
-    named = ", ".join(map(_difference, checks))
-    inliers = support.estimate.inliers
-    message = f"{inliers.sum()} of {len(inliers)} matches agree with the pose; all together fit one of {named} better"
+    checks = _differences(sent, prior_sigma, given, best.camera, steps)
+    gain = best.total / own.total if own.total > 0 else np.inf if best.total > 0 else 0.0
+    return Comparison(float(gain), sigmas_of_gains(best.scores - own.scores), tested, checks, sent.distortion)
+
+
+def wrong_camera(support: PosedSupport, best_reference: str) -> Rejection | None:
+    """A rejection if a pose of another camera scores clearly higher; it names the camera if that is significant.
+
+    A pose that rests on matches without points is compared whatever the linear check says, with few cameras by a brief
+    search.
+    """
+    evidence, by_lines = support.estimate.intrinsics, support.two_view is not None
+    if not by_lines and (evidence is None or not _is_doubtful(evidence)):
+        return None
+    found = compare_cameras(support)
+    if found is None:
+        return None
+    inliers, least = support.estimate.inliers, 1.0
+    if not by_lines:
+        count = int((~support.matches.guided).sum())
+        least = MIN_GAIN if count >= MANY_MATCHES and inliers.mean() < LARGE_SHARE else MIN_GAIN_ELSE
+    if found.gain < least:
+        return None
+    agreeing = f"{inliers.sum()} of {len(inliers)} matches agree with the pose"
+    if not found.is_significant:
+        few = "its matches with single references" if by_lines else agreeing
+        return Rejection(RejectionReason.GATE, f"{few}: too few to tell it from others that explain as much")
+    message = f"{agreeing}; all together fit one of {found.named} better"
     if by_lines:  # the matches with points may be none
-        message = f"its matches agree as well with a pose of {named}"
-    hint = Hint("judge", Advice.CHECK_CALIBRATION, advice_for(sent.distortion, checks), best_reference)
-    is_evidence = not is_doubted or best[0] >= CLEAR_GAIN * own
-    return Rejection(RejectionReason.GATE, message, hint, intrinsics_checks=checks if is_evidence else ())
+        message = f"its matches agree better with a pose of {found.named}"
+    hint = Hint("judge", Advice.CHECK_CALIBRATION, found.advice, best_reference)
+    return Rejection(RejectionReason.GATE, message, hint, intrinsics_checks=found.checks)
 
 
 def _difference(check: IntrinsicsCheck) -> str:

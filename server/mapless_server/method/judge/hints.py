@@ -1,4 +1,8 @@
-"""Hints: what would help after a rejection, by its numbers of features, of matches with each reference, of inliers."""
+"""Hints: what would help after a rejection, by its numbers of features, of matches with each reference, of inliers.
+
+Where much is shared and little agrees, the photograph's camera is compared with others (`cameras`), and named if that
+is significant; nothing else is said of intrinsics.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,6 +13,7 @@ from ..bundle.estimate import PosedSupport
 from ..features.views import PosedView, View
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .answer import Answer
+from .cameras import compare_cameras
 
 _STAGES = {
     RejectionReason.NO_USABLE_REFERENCES: "coarse",
@@ -21,6 +26,14 @@ _STAGES = {
 }
 """The stages that reject for these reasons; for the others it is the judge."""
 
+_OF_MATCHES = (
+    RejectionReason.LOW_OVERLAP,
+    RejectionReason.TOO_FEW_MATCHES,
+    RejectionReason.PNP_FAILED,
+    RejectionReason.GATE,
+)
+"""Reasons for which too few matches agree."""
+
 FEW_FEATURES = 200
 """A photograph with fewer is dark, blurred or shows nothing; sharp ones have 500 to 2048."""
 
@@ -28,7 +41,7 @@ FEW_MATCHES = 30
 """References of another place have fewer matches with a photograph by chance."""
 
 MANY_MATCHES = 100
-"""So many with one reference are not chance; if they have no common pose, intrinsics or poses are wrong."""
+"""So many with one reference are not chance; if they have no common pose, something is wrong."""
 
 MUCH_IGNORED = 0.5
 """Share of a photograph that masks seldom ignore: vehicles, grippers and people take less, inverted ones more."""
@@ -72,6 +85,12 @@ def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_pri
         len(references),
         has_prior,
     )
+    if rejection.reason in _OF_MATCHES and _agrees_little(case) and answer.support is not None:
+        compared = compare_cameras(answer.support)
+        if compared is not None and compared.is_significant:
+            message = f"{compared.advice} All matches together fit a camera with {compared.named} better."
+            hint = Hint("judge", Advice.CHECK_CALIBRATION, message, case.best)
+            return replace(answer, outcome=replace(rejection, hint=hint, intrinsics_checks=compared.checks))
     advice, message = _advice(case)
     share = query.photograph.ignored_share if query.photograph else 0.0
     if share >= MUCH_IGNORED or (share > 0 and case.features < FEW_FEATURES):
@@ -140,16 +159,23 @@ def _of_overlap(case: _Case) -> tuple[Advice, str]:
             f"Add references that show the same as {case.best} from a step aside: {shared}, but of the photograph's "
             f"matches only {case.tried} have a point that a second reference shows as well, as depth requires.",
         )
-    if case.matches >= MANY_MATCHES and case.inliers < case.matches / 4:
+    if _agrees_little(case):
         agreeing = f"{case.inliers} of {case.tried} matches with points agree on a pose" if case.tried else "few agree"
         return (
-            Advice.CHECK_CALIBRATION,
-            f"Check the photograph's intrinsics and the references' poses: {shared}, but {agreeing}.",
+            Advice.ADD_REFERENCES,
+            f"Add references that show the same as {case.best} from other places, or take another photograph: "
+            f"{shared}, but {agreeing}. What repeats or has moved does not, nor what has wrong poses of references, "
+            "which `mapless-server audit` names.",
         )
     return (
         Advice.LOOK_AT_REFERENCE,
         f"Point the camera at what the best reference shows, or add references from nearer: {shared}.",
     )
+
+
+def _agrees_little(case: _Case) -> bool:
+    """Whether one reference shares more with the photograph than chance could, and little of it agrees on a pose."""
+    return case.matches >= MANY_MATCHES and case.inliers < case.matches / 4
 
 
 def _retake(case: _Case) -> str:

@@ -142,7 +142,7 @@ def contradiction(
     """Rejects a pose whose references, intrinsics or other matches contradict it, or whose radius is too large.
 
     The latter has the pose, with the covariance (6, 6) that it would be answered with, unless it is doubted for lack of
-    evidence, too; for such a one see also `wrong_camera`.
+    evidence, too.
     """
     if disagreeing := disagreeing_references([supporters_of(support)]):
         return disagreeing
@@ -151,7 +151,7 @@ def contradiction(
     wrong = wrong_intrinsics(evidence, best) if evidence else None
     if wrong:
         return wrong
-    if wrong := wrong_camera(support, best, is_doubted):
+    if wrong := wrong_camera(support, best):
         return wrong
     hypotheses = find_rival(support, votes)
     if hypotheses:

@@ -115,6 +115,21 @@ def score(evidence: Evidence, world_from_query: RigidTransform) -> float:
     return float(_scores_along(evidence, rotation, centre, np.zeros(3), np.zeros(1))[0])
 
 
+def scores_by_keypoint(evidence: Evidence, world_from_query: RigidTransform) -> Array:
+    """The parts (F,) of the score of a pose by the query's keypoints."""
+    camera, points = evidence.query.camera, evidence.points
+    lines = np.nan_to_num(evidence.two_view.sampson_px(world_from_query) / EPIPOLAR_PX, nan=np.inf)
+    errors = np.nan_to_num(points.errors_px(world_from_query) / PNP.inlier_px, nan=np.inf)
+    parts = (
+        (evidence.two_view.keypoint, lines, band_chance(camera)),
+        (evidence.keypoint, errors, disc_chance(camera, PNP.inlier_px)),
+    )
+    total = np.zeros(len(evidence.query.features))
+    for keypoint, residual, chance in parts:
+        np.add.at(total, keypoint, -np.log10(chance) * np.clip(1 - residual**2, 0, None))
+    return total
+
+
 def _scores_along(evidence: Evidence, rotation: Array, centre: Array, direction: Array, distance: Array) -> Array:
     """Scores (S,) at centre + distance * direction, for S distances."""
     camera = evidence.query.camera

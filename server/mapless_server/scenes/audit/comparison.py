@@ -12,6 +12,7 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage
+from mapless_server.method.bundle.significance import least_sigmas
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge.judge import JudgeOptions, judge
 from mapless_server.method.optim.optimize import world_covariance
@@ -135,12 +136,12 @@ class Comparison:
         return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self._covariance[3:, 3:])[-1])))
 
     def focal_is_right(self, free: Free) -> bool:
-        """Whether a fit's focal length is the given one, within the tolerance and its own standard deviation."""
+        """Whether a fit's focal length is the given one, within the tolerance and what is not significant."""
         fit, rows = self.fits[free], list(free.value)
         variance = np.linalg.inv(fit.information[np.ix_(rows, rows)] + 1e-9 * np.eye(len(rows)))[-1, -1]
         sigma = _INFLATION * float(np.sqrt(max(variance, 0.0)))
         ratio = fit.camera.focal_x_px / self.subject.view.camera.focal_x_px
-        return abs(ratio - 1) <= max(_FOCAL_TOLERANCE, SIGNIFICANCE_SIGMA * sigma)
+        return abs(ratio - 1) <= max(_FOCAL_TOLERANCE, least_sigmas(tested=1) * sigma)
 
     def excess(self, free: Free) -> float:
         """Robust cost per match of a fit, minus that of the fit that may change everything."""
