@@ -163,7 +163,7 @@ def test_a_further_attempt_is_one_row(setting: Setting, monkeypatch: pytest.Monk
     result = setting.localize()
     rungs: Sequence[str] = [it.rung for it in result.attempts]
     assert rungs == ["as it is", "again", "stronger"]
-    assert again.change(Attempt(), None) != Attempt()
+    assert again.change(Attempt(), ladder.Situation()) != Attempt()
 
 
 @pytest.mark.parametrize("is_part", [True, False])

@@ -16,13 +16,13 @@ from support.compare import pose_error
 from support.corner import CAMERA, photograph, pose
 from support.images import encode, textured
 
-from mapless.axes import turned_raster
-from mapless.geometry import Camera
+from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine import choosing
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import TURN, Caller, Photo, Query, QueryViews, RasterForm, Result, Tier
+from mapless_server.engine.query import MIRROR, Caller, Photo, Query, QueryViews, Result, Tier
 from mapless_server.engine.search import Search
 from mapless_server.images import ImageLimits, decode_image
+from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.views import Ignored, View, view_of
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import DoubtOptions, LocalizeOptions
@@ -56,26 +56,14 @@ class UprightSift:
         return view_of(camera, np.array([it.pt for it in found]), descriptors.astype(np.uint8), sizes_px)
 
 
-@dataclass
-class Blind(UprightSift):
-    """Features of which those of further photographs match only by chance, once `is_blind`."""
-
-    name: str = "blind"
-    is_blind: bool = False
-
-    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
-        view = super().extract(image, camera, ignored)
-        if not self.is_blind:
-            return view
-        chance = np.random.default_rng(int(image.sum(dtype=np.int64)))
-        descriptors = chance.permuted(view.features.descriptors, axis=1)
-        return replace(view, features=replace(view.features, descriptors=descriptors))
-
-
 @pytest.fixture(scope="module")
 def localize(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
-    with localizing(tmp_path_factory.mktemp("store"), [Tier(UprightSift(), Pipeline(), upright_only=True)]) as answer:
+    with localizing(tmp_path_factory.mktemp("store"), tiers()) as answer:
         yield answer
+
+
+def tiers() -> list[Tier]:
+    return [Tier(UprightSift(), Pipeline()), Tier(SiftExtractor(), Pipeline(), any_roll=True)]
 
 
 @contextmanager
@@ -102,23 +90,31 @@ def localizing(folder: Path, tiers: Sequence[Tier], doubtful_trust: float = 0.25
     loop.close()
 
 
-def turned_camera(quarter_turns: int) -> Camera:
-    camera = CAMERA
-    for _ in range(quarter_turns):
-        width, height, x, y = camera.width_px, camera.height_px, camera.principal_x_px, camera.principal_y_px
-        camera = Camera(height, width, camera.focal_y_px, camera.focal_x_px, height - 1 - y, x)
-    return camera
+def rolled(image: NDArray[np.uint8], angle_deg: float) -> tuple[NDArray[np.uint8], Camera, RigidTransform]:
+    """The photograph turned clockwise about its centre, all of it on black, with its camera and pose."""
+    cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    turn, sides = np.array([[cos, -sin], [sin, cos]]), np.array([CAMERA.width_px, CAMERA.height_px])
+    width, height = (int(it) for it in np.ceil(np.abs(turn) @ sides - 1e-6))
+    new = (np.array([width, height]) - 1) / 2
+    offset = new - turn @ ((sides - 1) / 2)
+    turned = cv2.warpAffine(image, np.column_stack([turn, offset]), (width, height))
+    x, y = turn @ (CAMERA.principal_x_px, CAMERA.principal_y_px) + offset
+    camera = replace(CAMERA, width_px=width, height_px=height, principal_x_px=float(x), principal_y_px=float(y))
+    old_from_turned = np.eye(3)
+    old_from_turned[:2, :2] = turn.T
+    return np.asarray(turned, np.uint8), camera, RigidTransform(TRUE.rotation @ old_from_turned, TRUE.translation)
 
 
-@pytest.mark.parametrize(("quarter_turns", "named"), [(1, NAMED), (2, ()), (3, ())], ids=str)
+@pytest.mark.parametrize(
+    ("angle_deg", "named"), [(90.0, NAMED), (180.0, ()), (270.0, ()), (37.0, ()), (225.0, NAMED)], ids=str
+)
 def test_a_turned_photograph_gets_the_pose_of_its_raster(
-    localize: Localize, quarter_turns: int, named: tuple[str, ...]
+    localize: Localize, angle_deg: float, named: tuple[str, ...]
 ) -> None:
-    image = decode_image(photograph(TRUE), ImageLimits())
-    turned = encode(".png", np.ascontiguousarray(np.rot90(image, -quarter_turns)))
-    outcome = localize(turned, turned_camera(quarter_turns), named).answer.outcome
+    image, camera, true = rolled(decode_image(photograph(TRUE), ImageLimits()), angle_deg)
+    outcome = localize(encode(".png", image), camera, named).answer.outcome
     assert isinstance(outcome, Localization)
-    off_m, off_deg = pose_error(outcome.world_from_camera, turned_raster(TRUE, quarter_turns))
+    off_m, off_deg = pose_error(outcome.world_from_camera, true)
     assert off_m < 0.01
     assert off_deg < 0.2
 
@@ -126,12 +122,11 @@ def test_a_turned_photograph_gets_the_pose_of_its_raster(
 def test_an_upright_photograph_is_not_tried_turned(localize: Localize) -> None:
     result = localize(photograph(TRUE), CAMERA, ())
     assert isinstance(result.answer.outcome, Localization)
-    assert not any(stage.endswith(TURN) for stage in result.stage_seconds)
+    assert "turned" not in {it.rung for it in result.attempts}
 
 
 def test_an_accepted_pose_of_little_trust_is_not_tried_turned(tmp_path: Path) -> None:
-    tier = Tier(UprightSift(), Pipeline(), upright_only=True)
-    with localizing(tmp_path, [tier], doubtful_trust=1.1) as answer:
+    with localizing(tmp_path, tiers(), doubtful_trust=1.1) as answer:
         result = answer(photograph(TRUE), CAMERA)
     assert isinstance(result.answer.outcome, Localization)
     assert "turned" not in [it.rung for it in result.attempts]
@@ -141,7 +136,7 @@ def test_a_photograph_found_beyond_its_limits_is_not_tried_turned(localize: Loca
     result = localize(photograph(TRUE), CAMERA, NAMED, Narrowing(position=Sphere(TRUE.translation + 5.0, 1.0)))
     assert isinstance(result.answer.outcome, Rejection)
     assert result.answer.outcome.reason is RejectionReason.PRIOR_CONFLICT
-    assert not any(stage.endswith(TURN) for stage in result.stage_seconds)
+    assert "turned" not in {it.rung for it in result.attempts}
 
 
 @pytest.mark.parametrize("named", [NAMED, ()], ids=["named", "chosen"])
@@ -157,55 +152,31 @@ def test_a_mirrored_photograph_is_rejected_as_mirrored(localize: Localize, named
 
 
 @pytest.mark.parametrize(
-    ("upright", "turned", "mirrored", "used"),
-    [
-        (0, 0, 0, 0),
-        (20, 29, 0, 0),
-        (20, 30, 0, 1),
-        (20, 0, 45, 0),
-        (20, 0, 70, None),
-        (20, 60, 70, 1),
-        (2000, 0, 2900, 0),
-        (2000, 0, 3000, None),
-    ],
+    ("as_it_is", "mirrored", "is_mirrored"),
+    [(0, 0, False), (0, 20, True), (20, 45, False), (20, 70, True), (2000, 2900, False), (2000, 3000, True)],
 )
-def test_turned_or_mirrored_is_what_matches_clearly_more(
-    upright: int, turned: int, mirrored: int, used: int | None, monkeypatch: pytest.MonkeyPatch
+def test_mirrored_is_what_matches_clearly_more(
+    as_it_is: int, mirrored: int, is_mirrored: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Half as much again as all else; mirrored moreover not by chance, as 45 of 65 matches may be."""
+    """Half as much again, and not by chance, as 45 of 65 matches may be."""
 
     def planted(search: Search, views: QueryViews, tier: Tier) -> tuple[int, str]:
-        by_turns = {0: upright, 1: turned}.get(views.form.quarter_turns, 0)
-        return (mirrored if views.form.is_mirrored else by_turns), "r3"
+        return (mirrored if views.form.is_mirrored else as_it_is), "r3"
 
     monkeypatch.setattr(choosing, "_most_matches", planted)
     photo = Photo(photograph(TRUE), CAMERA, "image")
     query = Query(SCENE, NAMED, photo, ANYWHERE, 8, LocalizeOptions())
     search = Search.begin(query, cast(Any, None), QueryViews(photo, ImageLimits()), time.monotonic() + 60)
-    found = choosing.turned_to_match(search, Tier(UprightSift(), Pipeline()))
-    if used is not None:
-        assert found == RasterForm(quarter_turns=used)
-    else:
-        assert isinstance(found, Rejection)
+    found = choosing.mirrored(search, Tier(SiftExtractor(), Pipeline()))
+    assert (found is not None) == is_mirrored
+    if found is not None:
         assert found.hint is not None
         assert found.hint.best_reference == "r3"
-        assert f"{mirrored} matches with a reference, as it is or turned at most {upright}" in found.message
+        assert f"{mirrored} matches with a reference, as it is at most {as_it_is}" in found.message
 
 
 def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:
     image = encode(".png", textured(CAMERA.width_px, CAMERA.height_px, seed=5))
     result = localize(image, CAMERA, ())
     assert isinstance(result.answer.outcome, Rejection)
-    assert f"upright-sift/{TURN}" in result.stage_seconds
-
-
-def test_a_turn_that_shows_no_more_is_not_searched_further(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Matches by chance may be clearly more in a turned raster; stronger features still get the photograph as it is."""
-    monkeypatch.setattr(choosing, "turned_to_match", lambda search, tier: RasterForm(quarter_turns=1))
-    first = Blind()
-    tiers = [Tier(first, Pipeline(), upright_only=True), Tier(UprightSift(), Pipeline(), upright_only=True)]
-    with localizing(tmp_path, tiers) as answer:
-        first.is_blind = True
-        result = answer(photograph(TRUE), CAMERA)
-    assert isinstance(result.answer.outcome, Localization)
-    assert result.tier.features == "upright-sift"
+    assert any(stage.endswith(MIRROR) for stage in result.stage_seconds)

@@ -1,5 +1,7 @@
 """The order of attempts, by the doubts that are left."""
 
+from dataclasses import replace
+
 import pytest
 
 from mapless_server.method import ladder
@@ -10,8 +12,9 @@ from mapless_server.method.pairs.pair import Matching
 ALL = Situation(
     may_be_elsewhere=True,
     has_place=True,
-    can_match_strongly=(False, True),
-    upright_only=True,
+    can_match_strongly=(False, False, True),
+    any_roll=1,
+    angles_deg=(90.0,),
 )
 
 
@@ -19,10 +22,11 @@ def climbed(doubts: Doubt, situation: Situation) -> list[str]:
     """The rungs that are tried if every attempt leaves these doubts."""
     _, attempt = first_attempt(situation)
     tried, names = [attempt], list[str]()
-    while following := next(further(attempt, None, tried, doubts, situation), None):
-        rung, attempt = following
-        tried.append(attempt)
+    while following := next(further(attempt, tried, doubts, situation), None):
+        rung, made = following
+        tried.append(made)
         names.append(rung.name)
+        attempt = attempt if made.raster is Raster.MIRRORED else made  # it has a result only if it ends the ladder
         assert len(names) < 100
     return names
 
@@ -44,8 +48,8 @@ def climbed(doubts: Doubt, situation: Situation) -> list[str]:
         (Doubt.LIKE_ELSEWHERE, Situation(may_be_elsewhere=True), ["elsewhere"]),
         (
             Doubt.STARVED,
-            Situation(can_match_strongly=(False, True), upright_only=True),
-            ["wide", "lines", "turned", "wide", "lines", "stronger", "rematched", "wide", "lines"],
+            Situation(can_match_strongly=(False, False, True), any_roll=1),
+            ["wide", "lines", "any roll", *("mirrored", "wide", "lines"), "stronger", *("rematched", "wide", "lines")],
         ),
     ],
 )
@@ -61,16 +65,18 @@ def test_the_ladder_ends(doubts: Doubt) -> None:
 def test_no_attempt_is_made_twice() -> None:
     attempt = Attempt(1, matching=Matching.STRONG_WIDE, solver=Solver.LINES)
     tried = [attempt, Attempt(1)]
-    for _, following in further(attempt, None, tried, ~Doubt.CAMERA, ALL):
+    for _, following in further(attempt, tried, ~Doubt.CAMERA, ALL):
         assert following not in tried
 
 
-def test_stronger_features_keep_the_turn_of_the_best_pose() -> None:
-    turned = Attempt(raster=Raster.TURNED, angle_deg=90.0)
-    situation = Situation(can_match_strongly=(False, False))
-    for best, expected in ((turned, turned), (None, Attempt())):
-        (_, attempt) = next(it for it in further(turned, best, [turned], Doubt.LOW_TRUST, situation))
-        assert (attempt.features, attempt.raster, attempt.angle_deg) == (1, expected.raster, expected.angle_deg)
+@pytest.mark.parametrize("before", [Attempt(), Attempt(1)])
+def test_upright_features_are_found_turned_as_the_roll_is_known(before: Attempt) -> None:
+    situation = Situation(can_match_strongly=(False, False, False), any_roll=1, angles_deg=(30.0, 210.0))
+    tried = [before, Attempt(raster=Raster.TURNED, angles_deg=(30.0, 210.0))]
+    changed = {rung.name: it for rung, it in further(before, [before], Doubt.STARVED, situation)}
+    assert changed["turned"] == tried[1]
+    assert changed["stronger"] == replace(tried[1], features=2)
+    assert "any roll" not in changed or changed["any roll"] == Attempt(1)
 
 
 def test_tracking_comes_first_where_a_prior_says_what_is_near() -> None:

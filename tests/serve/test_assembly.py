@@ -89,13 +89,14 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
     save_file(EdgePoint2(VARIANTS["l64"]).state_dict(), tmp_path / "weights" / "edgepoint2-l64.safetensors")
     with caplog.at_level(logging.INFO):
         for device in ("cpu", "cuda"):
-            assert feature_names(settings(tmp_path), device) == ("edgepoint2-l64",)
-        (tier,) = make_tiers(settings(tmp_path, device="cpu"))
+            assert feature_names(settings(tmp_path), device) == ("edgepoint2-l64", "sift")
+        tier, any_roll = make_tiers(settings(tmp_path, device="cpu"))
+    assert (tier.any_roll, any_roll.any_roll) == (False, True)
     assert tier.extractor.name.startswith("edgepoint2-l64-")
     chosen, record = caplog.records
     assert chosen.getMessage() == f"descriptors are multiplied as {fastest_arithmetic().value}"
     assert tier.pipeline.matcher.pairs.arithmetic is fastest_arithmetic()
-    assert record.getMessage().startswith("features auto: edgepoint2-l64; with aliked and aliked-")
+    assert record.getMessage().startswith("features auto: edgepoint2-l64 and sift; with aliked and aliked-")
     assert record.getMessage().endswith("run `mapless-server weights fetch aliked aliked-lightglue`")
 
 
@@ -114,12 +115,12 @@ def test_a_server_without_networks_does_not_load_torch(tmp_path: Path) -> None:
     assert printed(program, tmp_path) == "False\n"
 
 
-def test_on_a_gpu_the_strong_features_answer_alone(tmp_path: Path) -> None:
+def test_on_a_gpu_the_strong_features_come_first(tmp_path: Path) -> None:
     (tmp_path / "weights").mkdir()
     for name in ("aliked-n16", "edgepoint2-l64"):
         (tmp_path / "weights" / f"{name}.safetensors").touch()
-    assert feature_names(settings(tmp_path), "cuda") == ("aliked",)
-    assert feature_names(settings(tmp_path), "cpu") == ("edgepoint2-l64", "aliked")
+    assert feature_names(settings(tmp_path), "cuda") == ("aliked", "sift")
+    assert feature_names(settings(tmp_path), "cpu") == ("edgepoint2-l64", "sift", "aliked")
 
 
 def test_a_missing_device_ends_the_start(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Which references a query uses: those that it names, or those that resemble the photograph and match it most.
 
-Also whether the photograph matches them more if it is turned, and whether references elsewhere contradict its pose.
+Also how the photograph is rolled against them, and whether references elsewhere contradict its pose.
 """
 
 import logging
@@ -8,13 +8,23 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 from scipy.special import bdtrc
 
 from mapless_server.engine.query import QueryViews, RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
+from mapless_server.method.features.rolls import (
+    LEAST_AGREEMENT,
+    rasters_of,
+    roll_about_axis,
+    roll_of_directions,
+    roll_of_rotation,
+    similarity_of,
+)
+from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.decide import PLACES
-from mapless_server.method.judge.hypothesis import Found, Hypothesis, Where
+from mapless_server.method.judge.hypothesis import Found, Hypothesis, Raster, Where
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Choice, Narrowing, Selection
 from mapless_server.scenes.library import Loaded, load_usable
@@ -23,7 +33,7 @@ from mapless_server.scheduling import Abandoned, Failure
 
 from . import tracking
 from .failures import failure_of
-from .query import TURN, Tier
+from .query import MIRROR, Tier
 from .search import Search
 
 log = logging.getLogger(__name__)
@@ -32,8 +42,8 @@ SHORTLIST = 2
 """So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
 BENCHMARKS.md)."""
 
-TURN_REFERENCES = 10
-"""A photograph is compared with so many references each way round, the most similar first."""
+MIRROR_REFERENCES = 10
+"""A photograph and its mirror image are compared with so many references, the most similar first."""
 
 MIRRORED_BY_CHANCE = 1e-6
 """A photograph is mirrored only if matches that are as likely with it as with its mirror image would be shared so
@@ -45,9 +55,9 @@ def described_anew(search: Search, tier: Tier) -> Material | None:
     attempt, verdict, query = search.attempt, search.verdict, search.query
     if attempt.where is Where.ONE_PLACE and verdict is not None and verdict.place is not None:
         return search.materials[search.found.index(verdict.chosen)].of_place(verdict.place, attempt.basis)
-    if attempt.where is Where.ANYWHERE and _is_same_anywhere(search):
+    if attempt.where is Where.ANYWHERE and _is_same_anywhere(search, tier):
         return None
-    views = search.views.in_form(RasterForm(quarter_turns=round(attempt.angle_deg / 90)))
+    views = search.views.in_form(RasterForm(attempt.angles_deg))
     found = _chosen(search, views, tier) if query.chooses else _named(search, views, tier)
     if tier.pipeline.matcher.pair_matching is None or found.query_matches is not None:
         return found
@@ -70,24 +80,62 @@ def load_chosen(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loa
     return load_usable(lambda some: _load(search, some, tier), reference_ids, (DataLoss,), report)
 
 
-def turned_to_match(search: Search, tier: Tier) -> RasterForm | Rejection:
-    """The raster in which clearly more of the photograph matches references than as it is; as it is if there is none.
+def rasters_in(search: Search, known_deg: tuple[float, ...]) -> tuple[float, ...]:
+    """By how much to turn the photograph, clockwise, so that references are upright in one of its rasters.
 
-    The best of its references counts: others may not show the same.
+    Matches with the photograph as it is show how it is rolled against references, those for any roll best; references
+    without enough matches are rolled against the others as their poses say. Where matches show nothing, priors may.
+
+    Args:
+        search: after an attempt.
+        known_deg: what earlier attempts have shown.
 
     Returns:
-        The raster; or the photograph's rejection, where its mirror image matches clearly more than any of these, and
-        not by chance. So it does if the photograph is mirrored, or shows another side of something symmetric: parts of
-        the place that look like the mirror image of others would give it a wrong pose.
+        The angles, degrees; empty if references are upright in the photograph as it is, or nothing shows that.
     """
-    forms = [*(RasterForm(quarter_turns=turns) for turns in range(4)), RasterForm(is_mirrored=True)]
-    *turned, mirrored = [_most_matches(search, search.views.in_form(form), tier) for form in forms]
-    best = max(turned, key=lambda it: it[0])
-    most, name = mirrored
-    chance = bdtrc(most - 1, most + best[0], 0.5) if most else 1.0
-    if most >= PLACES.clearly_more * best[0] and chance < MIRRORED_BY_CHANCE:
-        return _mirrored(most, best[0], name)
-    return forms[turned.index(best) if best[0] >= PLACES.clearly_more * turned[0][0] else 0]
+    material, attempt = search.material, search.attempt
+    if material is None or not material.query_matches or attempt.raster is not Raster.AS_IS:
+        return known_deg
+    references, matches = material.references, material.query_matches
+    found = [similarity_of(material.view, it.view, of) for it, of in zip(references, matches, strict=True)]
+    shown = [it if it is not None and it.agreement >= LEAST_AGREEMENT else None for it in found]
+    counts = [it.agreeing if it else 0 for it in shown]
+    best = int(np.argmax(counts))
+    if roll := shown[best]:
+        world_from_query = references[best].world_from_camera.rotation @ roll_about_axis(roll.clockwise_deg)
+        by_pose = (roll_of_rotation(it.world_from_camera.rotation.T @ world_from_query) for it in references)
+        rolls = [it.clockwise_deg if it else other for it, other in zip(shown, by_pose, strict=True)]
+        return rasters_of(rolls, counts)
+    return known_deg or rasters_of(*_rolls_by_priors(search, references))
+
+
+def _rolls_by_priors(search: Search, references: Sequence[PosedView]) -> tuple[list[float], list[int]]:
+    """The rolls that a prior on pose or gravity shows, of those references where it does."""
+    pose, gravity = search.query.priors.pose, search.query.priors.gravity
+    rolls: list[float | None] = []
+    for it in references:
+        reference_from_world = it.world_from_camera.rotation.T
+        if search.query.can_be_tracked and pose is not None:
+            rolls.append(roll_of_rotation(reference_from_world @ pose.world_from_camera.rotation))
+        elif gravity is not None:
+            rolls.append(roll_of_directions(gravity.in_camera, reference_from_world @ gravity.in_world))
+    known = [it for it in rolls if it is not None]
+    return known, [0] * len(known)
+
+
+def mirrored(search: Search, tier: Tier) -> Rejection | None:
+    """The photograph's rejection, if its mirror image matches a reference clearly more than it does, not by chance.
+
+    So it does if the photograph is mirrored, or shows another side of something symmetric: parts of the place that look
+    like the mirror image of others would give it a wrong pose. The best of its references counts: others may not show
+    the same.
+    """
+    as_it_is, _ = _most_matches(search, search.views, tier)
+    most, name = _most_matches(search, search.views.in_form(RasterForm(is_mirrored=True)), tier)
+    chance = bdtrc(most - 1, most + as_it_is, 0.5) if most else 1.0
+    if most >= PLACES.clearly_more * as_it_is and chance < MIRRORED_BY_CHANCE:
+        return _mirrored(most, as_it_is, name)
+    return None
 
 
 def resembles_elsewhere(search: Search, found: Found, tier: Tier) -> bool:
@@ -111,7 +159,7 @@ def _is_contradicted_elsewhere(search: Search, found: Hypothesis, tier: Tier) ->
     material = search.material
     assert material is not None
     assert material.choice is not None
-    others = _outside(search, material.choice)
+    others = _outside(search, material.choice, tier)
     if not others or others[0][1] > 0:
         return False
     with search.context.stage("correspond"):
@@ -119,19 +167,19 @@ def _is_contradicted_elsewhere(search: Search, found: Hypothesis, tier: Tier) ->
         return tracking.is_contradicted(found, material.view, rivals, tier.pipeline.matcher)
 
 
-def _is_same_anywhere(search: Search) -> bool:
+def _is_same_anywhere(search: Search, tier: Tier) -> bool:
     """Whether the references that were chosen where soft priors say are those that would be chosen anywhere."""
     material = search.material
     if material is None or material.choice is None or material.basis != search.attempt.basis.but(where=Where.LIKELY):
         return False
-    return not _outside(search, material.choice)
+    return not _outside(search, material.choice, tier)
 
 
-def _outside(search: Search, choice: Choice) -> list[tuple[str, int]]:
+def _outside(search: Search, choice: Choice, tier: Tier) -> list[tuple[str, int]]:
     """Ids of references that resemble the photograph and were not chosen, with their rank among all."""
     inside = {it.reference_id for it in choice.references}
     with search.context.stage("retrieval"):
-        alike = _shortlisted(search, search.views, search.query.narrowing.limits).references
+        alike = _shortlisted(search, search.views, search.query.narrowing.limits, tier).references
     return [(it.reference_id, rank) for rank, it in enumerate(alike) if it.reference_id not in inside]
 
 
@@ -144,7 +192,7 @@ def _named(search: Search, views: QueryViews, tier: Tier) -> Material:
 def _chosen(search: Search, views: QueryViews, tier: Tier) -> Material:
     """Chooses, among the references that resemble the photograph most, those with the most matches."""
     query, context = search.query, search.context
-    choice = _shortlisted(search, views, _narrowing_of(search))
+    choice = _rolled_choice(search) or _shortlisted(search, views, _narrowing_of(search), tier)
     generation, shortlist = load_chosen(search, [it.reference_id for it in choice.references], tier)
     view = views.view(tier.extractor, context)
 
@@ -159,11 +207,19 @@ def _chosen(search: Search, views: QueryViews, tier: Tier) -> Material:
     return Material(search.attempt.basis, views, view, chosen, generation, choice, query_matches)
 
 
-def _shortlisted(search: Search, views: QueryViews, narrowing: Narrowing) -> Choice:
+def _rolled_choice(search: Search) -> Choice | None:
+    """The references chosen by what matches at any roll, for the photograph turned as it was found to be rolled."""
+    if not search.attempt.angles_deg:
+        return None
+    chosen = [it.choice for it in search.materials if it.views.form == RasterForm() and it.choice is not None]
+    return chosen[-1] if chosen else None
+
+
+def _shortlisted(search: Search, views: QueryViews, narrowing: Narrowing, tier: Tier) -> Choice:
     """Chooses the shortlist of references within limits and likely values of the pose."""
     query = search.query
     selection = Selection(SHORTLIST * query.reference_count, narrowing, query.reference_ids, THINNED_LATER)
-    return search.source.choose(query.scene_key, views, selection, search.context)
+    return search.source.choose(query.scene_key, views, selection, search.context, tier.extractor)
 
 
 def _load(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loaded:
@@ -175,26 +231,26 @@ def _load(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loaded:
 def _mirrored(most: int, not_mirrored: int, reference: str) -> Rejection:
     message = (
         "the photograph is mirrored, or shows another side of something symmetric: its mirror image has "
-        f"{most} matches with a reference, as it is or turned at most {not_mirrored}"
+        f"{most} matches with a reference, as it is at most {not_mirrored}"
     )
     advice = (
         "Send the photograph as the camera took it: previews of front cameras and some videos exchange left and right "
         "(if so, the principal point is at width - 1 - x). If it is as taken, add references of this side."
     )
-    return Rejection(RejectionReason.GATE, message, Hint(TURN, Advice.CHECK_CALIBRATION, advice, reference))
+    return Rejection(RejectionReason.GATE, message, Hint(MIRROR, Advice.CHECK_CALIBRATION, advice, reference))
 
 
 def _most_matches(search: Search, views: QueryViews, tier: Tier) -> tuple[int, str]:
     """Most matches of the photograph with one of the references that it resembles, or of those named; its name."""
     query = search.query
-    with search.context.stage(TURN):
+    with search.context.stage(MIRROR):
         view = views.view(tier.extractor, search.context)
     if query.chooses:
-        chosen = _shortlisted(search, views, _narrowing_of(search)).references[:TURN_REFERENCES]
+        chosen = _shortlisted(search, views, _narrowing_of(search), tier).references[:MIRROR_REFERENCES]
         references = load_chosen(search, [it.reference_id for it in chosen], tier)[1]
     else:
-        references = _load(search, query.reference_ids[:TURN_REFERENCES], tier)[1]
-    with search.context.stage(TURN):
+        references = _load(search, query.reference_ids[:MIRROR_REFERENCES], tier)[1]
+    with search.context.stage(MIRROR):
         matches = tier.pipeline.matcher.match_quickly(view, references, search.context.check)
     counts = list(map(len, matches))
     best = max(range(len(counts)), key=counts.__getitem__, default=None)

@@ -33,7 +33,7 @@ def after_rejection(queries: Sequence[Query], outcome: Rejection) -> list[Query]
     from mapless_server.method.ladder import Situation, further
 
     situation = Situation(may_be_elsewhere=any(it.chooses and it.narrowing.has_likely for it in queries))
-    following = further(Attempt(), None, [Attempt()], doubt_of(outcome), situation)
+    following = further(Attempt(), [Attempt()], doubt_of(outcome), situation)
     if not any(attempt.where is Where.ANYWHERE for _, attempt in following):
         return None
     return [replace(it, narrowing=it.narrowing.limits) for it in queries]

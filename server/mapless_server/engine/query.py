@@ -14,6 +14,7 @@ import numpy as np
 from mapless_server import __version__
 from mapless_server.images import ImageLimits, decode_image, decode_mask
 from mapless_server.method.bundle.priors import NO_PRIORS, Priors
+from mapless_server.method.features.extractors import Mirrors
 from mapless_server.method.features.extractors.turned import extract_turned
 from mapless_server.method.features.views import Photograph, reduce_image
 from mapless_server.method.options import StageContext, Variant
@@ -80,13 +81,13 @@ class RasterForm:
     """The raster in which features of a photograph are found.
 
     Attributes:
-        quarter_turns: clockwise, of the raster; pixels of the features are of the photograph as it is.
+        angles_deg: the raster is turned clockwise by each of these; pixels of the features are of the photograph as it
+            is. Empty if it is not turned.
         max_pixels: about so many at most; None for all.
-        is_mirrored: whether it is exchanged left and right, and pixels of the features are of that: such a view can be
-            matched, but has no pose.
+        is_mirrored: whether descriptors are those of the mirror image: such a view can be matched, but has no pose.
     """
 
-    quarter_turns: int = 0
+    angles_deg: tuple[float, ...] = ()
     max_pixels: int | None = None
     is_mirrored: bool = False
 
@@ -131,6 +132,11 @@ class QueryViews:
     def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
         """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
         known, key = self._decoded.views, (extractor.name, self.form)
+        if key not in known and self.form.is_mirrored:
+            assert isinstance(extractor, Mirrors)
+            known[key] = extractor.mirrored(
+                self.in_form(replace(self.form, is_mirrored=False)).view(extractor, context)
+            )
         if key not in known:
             photograph = self._decoded.read(context)
             with context.stage("features"):
@@ -147,11 +153,8 @@ def _extracted(extractor: FeatureExtractor, photograph: Photograph, form: Raster
     if form.max_pixels is not None:
         share = min(1.0, math.sqrt(form.max_pixels / (camera.width_px * camera.height_px)))
         pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
-    if form.is_mirrored:
-        mirrored = None if ignored is None else ignored[:, ::-1]
-        return extractor.extract(np.ascontiguousarray(pixels[:, ::-1]), camera, mirrored)
-    if form.quarter_turns:
-        return extract_turned(extractor, pixels, camera, form.quarter_turns, ignored)
+    if form.angles_deg:
+        return extract_turned(extractor, pixels, camera, form.angles_deg, ignored)
     return extractor.extract(pixels, camera, ignored)
 
 
@@ -164,8 +167,8 @@ POSE_PRIOR = "pose-prior"
 TRACK = "track"
 """The stage of choosing references by the prior and comparing others; or the whole attempt, if it did not suffice."""
 
-TURN = "turn"
-"""The stage of comparing a photograph that was not localized, or with little trust, with its references turned, too."""
+MIRROR = "mirror"
+"""The stage of comparing a photograph that was not localized, and its mirror image, with references."""
 
 MAX_TRACKED_SIGMA_DEG = 20.0
 """Priors of a less certain rotation do not say what the photograph shows."""
@@ -180,13 +183,13 @@ class Tier:
 
     The pipeline's matcher caches matches of these features, so no other tier may have the same one; tiers may share a
     reconstructor. References of a tier that `uses_depths` are loaded with the depths stored with them. Features that
-    are `upright_only` match nothing in a photograph that is turned by 90 or 180 degrees against the references.
+    match at `any_roll` of the camera, whose extractor `Mirrors`, may follow upright ones.
     """
 
     extractor: FeatureExtractor
     pipeline: Pipeline
     uses_depths: bool = False
-    upright_only: bool = False
+    any_roll: bool = False
 
     @property
     def features(self) -> str:
@@ -368,8 +371,15 @@ class ReferenceSource(Protocol):
         """Returns the attributes of a scene."""
         ...
 
-    def choose(self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext) -> Choice:
-        """Chooses references for a photograph."""
+    def choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        selection: Selection,
+        context: StageContext,
+        extractor: FeatureExtractor | None = None,
+    ) -> Choice:
+        """Chooses references for a photograph, by what is made of this extractor's features if there is such."""
         ...
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:

@@ -1,7 +1,7 @@
 """The references of all scenes, for the stages of a query, and for what callers ask of references."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from mapless.names import reference_name
 from mapless_server.engine.query import Description, Photo, QueryViews
@@ -11,6 +11,8 @@ from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.scenes import Choice, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
+from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.retrieval.index import GlobalDescriptor
 from mapless_server.scenes.retrieval.ranking import nearest_references
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey, scene_id_of
@@ -19,19 +21,32 @@ from mapless_server.store import SceneAttributes
 from .query import POSE_PRIOR
 
 
+@dataclass(frozen=True, eq=False)
+class Retrieval:
+    """What chooses references: a descriptor made of a photograph's features or pixels, and the scenes' indexes of it.
+
+    Photographs are described with the extractor before.
+    """
+
+    descriptor: GlobalDescriptor
+    extractor: FeatureExtractor
+    indexes: SceneIndexes
+
+
 class References:
     """The references of all scenes: loaded, chosen, described, audited. Safe to use from several threads."""
 
     def __init__(
         self,
         tools: SceneTools,
+        retrievals: Sequence[Retrieval],
         extractors: Sequence[FeatureExtractor],
         limits: ImageLimits,
         agreements: SceneAgreements,
     ) -> None:
-        """The agreements say which scenes contradict themselves.
+        """The first retrieval chooses for features without one; the agreements say which scenes contradict themselves.
 
-        Raises ValueError unless the descriptor is computed from the first extractor's features.
+        Raises ValueError unless the first descriptor is computed from the first extractor's features.
         """
         descriptor = tools.descriptor
         if descriptor.extractor not in (None, extractors[0].name):
@@ -40,8 +55,7 @@ class References:
         self.report_damaged = tools.indexes.report_damaged
         self.agreements = agreements
         self._tools = tools
-        self._indexes = tools.indexes
-        self._descriptor = descriptor
+        self._retrievals = retrievals
         self._extractors = extractors
         self._limits = limits
 
@@ -51,20 +65,30 @@ class References:
         contradiction = self.agreements.known(scene_key).contradiction
         return replace(attributes, contradiction=contradiction) if contradiction else attributes
 
-    def choose(self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext) -> Choice:
+    def choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        selection: Selection,
+        context: StageContext,
+        extractor: FeatureExtractor | None = None,
+    ) -> Choice:
         """Chooses references for a photograph by its global descriptor, or near a pose prior without reading it.
 
-        NotFound if there is no such scene (field "scene") or reference (field "references[i]"); DataLoss if a named
-        reference is damaged (same field); InvalidArgument if the image is bad.
+        The descriptor is that of the extractor's features if they have one of their own; then FeaturesMissing if
+        references lack it, which are described in the background. NotFound if there is no such scene (field
+        "scene") or reference (field "references[i]"); DataLoss if a named reference is damaged (same field);
+        InvalidArgument if the image is bad.
         """
         # The scene comes first: a wrong name is found before the photograph is described.
-        entries = self._indexes.entries(scene_key, context)
+        main, own = self._retrievals[0], self._retrieval_of(extractor)
+        entries = main.indexes.entries(scene_key, context)
         if selection.near is not None:
             nearest = nearest_references(entries, selection.near, selection.count)
             return Choice(tuple(nearest), POSE_PRIOR, entries.generation)
         for index, reference_id in enumerate(selection.among):
             if reference_id not in entries:
-                if self._indexes.is_damaged(scene_key, reference_id):
+                if main.indexes.is_damaged(scene_key, reference_id):
                     message = f"reference {reference_id!r} is damaged in the store: delete it and add it again"
                     raise DataLoss(message, field=f"references[{index}]")
                 scene_id = scene_id_of(scene_key)
@@ -73,11 +97,17 @@ class References:
                 raise NotFound(message, field=f"references[{index}]", resource=name)
         if not len(entries):
             return Choice((), "", entries.generation)
-        view = views.view(self._extractors[0], context)
+        if own is not main:
+            entries = own.indexes.entries(scene_key, context, waits=False)
+        view = views.view(own.extractor, context)
         with context.stage("retrieval"):
-            vector = self._descriptor.describe(view)
+            vector = own.descriptor.describe(view)
             ranked = rank_references(entries, vector, selection)
-        return Choice(tuple(ranked), self._descriptor.name, entries.generation)
+        return Choice(tuple(ranked), own.descriptor.name, entries.generation)
+
+    def _retrieval_of(self, extractor: FeatureExtractor | None) -> Retrieval:
+        own = (it for it in self._retrievals if extractor is not None and it.extractor.name == extractor.name)
+        return next(own, self._retrievals[0])
 
     def describe(self, photo: Photo, check: Callable[[], None]) -> Description:
         """Computes all that the store keeps of a photograph, every tier's features.
@@ -86,14 +116,14 @@ class References:
         """
         decoded, context = QueryViews(photo, self._limits), StageContext(check)
         views = {it.name: decoded.view(it, context) for it in self._extractors}
-        vector = self._descriptor.describe(views[self._extractors[0].name])
+        vectors = {it.descriptor.name: it.descriptor.describe(views[it.extractor.name]) for it in self._retrievals}
         # A batch is held in memory until it is stored, so without its pixels.
         without_pixels = {name: replace(view, photograph=None) for name, view in views.items()}
         share = decoded.ignored_share(context)
         if share == 1:
             message = "the mask ignores the whole image: 0 means ignore, every other value use"
             raise InvalidArgument(message, reason="MASK_IGNORES_ALL", field=photo.mask_field)
-        return Description(without_pixels, {self._descriptor.name: vector}, share)
+        return Description(without_pixels, vectors, share)
 
     def auditor(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneAuditor:
         """Makes an auditor of a scene's references; the caller named those in `named`."""
@@ -101,13 +131,14 @@ class References:
 
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Frees the memory of a deleted scene."""
-        self._indexes.forget(scene_key)
+        for it in self._retrievals:
+            it.indexes.forget(scene_key)
         self.agreements.forget_scene(scene_key)
 
     @property
     def index_bytes(self) -> int:
         """Memory of the retrieval indexes, bytes."""
-        return self._indexes.size_bytes
+        return sum(it.indexes.size_bytes for it in self._retrievals)
 
     def close(self) -> None:
         """Ends the background work of the library and of the agreements."""

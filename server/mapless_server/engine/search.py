@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mapless_server.engine.query import QueryViews
 from mapless_server.method.features.views import Matches, PosedView, View
-from mapless_server.method.judge.hypothesis import Attempt, Hypothesis, Where
+from mapless_server.method.judge.hypothesis import Attempt, Where
 from mapless_server.method.ladder import Situation, first_attempt
 from mapless_server.method.options import StageContext, Variant
 from mapless_server.method.rejection import PoseHypothesis
@@ -45,6 +45,7 @@ class Material:
         is_strong: whether these are to be those of a network, as far as nearest neighbours find few.
         unmatched: indices of the references that the network has still to match, each in a step of its own, so that a
             busy server computes for other callers in between.
+        rematched: indices of those that it has matched.
     """
 
     basis: Attempt
@@ -56,6 +57,7 @@ class Material:
     query_matches: tuple[Matches, ...] | None = None
     is_strong: bool = False
     unmatched: tuple[int, ...] = ()
+    rematched: tuple[int, ...] = ()
 
     def serves(self, attempt: Attempt) -> bool:
         """Whether an attempt is computed from it."""
@@ -78,7 +80,9 @@ class Material:
         kept = [i for i, it in enumerate(self.references) if it.name in place.references]
         matches = None if self.query_matches is None else tuple(self.query_matches[i] for i in kept)
         references = tuple(self.references[i] for i in kept)
-        return replace(self, basis=basis, references=references, query_matches=matches, is_strong=False, unmatched=())
+        return replace(
+            self, basis=basis, references=references, query_matches=matches, is_strong=False, unmatched=(), rematched=()
+        )
 
 
 _COUNTS = (2, 5, 10, 20, 64)
@@ -86,6 +90,9 @@ _COUNTS = (2, 5, 10, 20, 64)
 
 SKIPPED, DOUBTFUL = "skipped", "doubtful"
 """Outcomes of an attempt that could not differ from an earlier one, and of tracking that left a doubt."""
+
+UNFINISHED = "unfinished", "failed", "out_of_memory"
+"""Outcomes of an attempt that did not come to an end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +128,7 @@ class Search:
         material: the photograph and references; None until they are chosen.
         prepared: the photographs' matches, for the stage `coarse`.
         coarse: the reconstruction that attempts of the material's basis begin with.
+        angles_deg: by how much to turn the photograph, see `Situation`.
     """
 
     query: Query
@@ -151,6 +159,7 @@ class Search:
     material: Material | None = None
     prepared: Prepared | None = None
     coarse: Coarse | None = None
+    angles_deg: tuple[float, ...] = ()
 
     @classmethod
     def begin(
@@ -176,7 +185,8 @@ class Search:
             may_be_elsewhere=can_be_elsewhere and query.narrowing.has_likely,
             has_place=place is not None and material is not None and len(place.references) < len(material.references),
             can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),
-            upright_only=tiers[0].upright_only,
+            any_roll=next((i for i, it in enumerate(tiers) if it.any_roll), None),
+            angles_deg=self.angles_deg,
         )
 
     def ended(self, outcome: str, features: str, has_result: bool = False) -> Search:
@@ -238,12 +248,6 @@ class Search:
             stage_start_s=None,
             stage_processor_s=None,
         )
-
-    @property
-    def best(self) -> Attempt | None:
-        """The attempt of the best pose so far."""
-        chosen = None if self.verdict is None else self.verdict.chosen
-        return chosen.attempt if isinstance(chosen, Hypothesis) else None
 
     @property
     def kind(self) -> str:

@@ -141,9 +141,10 @@ class QueryStages:
                 return Unavailable(
                     "the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0
                 )
-            # A failed attempt at a better answer must not cost the answer that there is.
             if isinstance(error, FeaturesMissing):  # which the library makes after the call
-                return self._unfinished(search, "unfinished", CutReason.FEATURES_MISSING)
+                features = self._verdicts.tier(search.attempt).features
+                return self._skipped(search.cut(search.rung, features, CutReason.FEATURES_MISSING), "unfinished")
+            # A failed attempt at a better answer must not cost the answer that there is.
             log.warning("the attempt %r failed; the answer before it is given", search.rung, exc_info=error)
             is_full = failure_of(error) is Failure.OUT_OF_MEMORY
             reason = CutReason.OUT_OF_MEMORY if is_full else CutReason.FAILED
@@ -172,13 +173,11 @@ class QueryStages:
             search = replace(search, attributes=attributes_of(search))
         if attempt.where is Where.NEAR_PRIOR:
             return self._tracked(search)
-        if attempt.raster is Raster.TURNED and not attempt.angle_deg:
-            form = choosing.turned_to_match(search, self._verdicts.tier(attempt))
-            if isinstance(form, Rejection):
-                return self._conclude(search, found_by(attempt, Answer(form), self._doubt, Doubt.CAMERA))
-            if not form.quarter_turns:
+        if attempt.raster is Raster.MIRRORED:
+            rejection = choosing.mirrored(search, self._verdicts.tier(attempt))
+            if rejection is None:
                 return self._skipped(search)
-            search = replace(search, attempt=attempt.but(angle_deg=90.0 * form.quarter_turns))
+            return self._conclude(search, found_by(attempt, Answer(rejection), self._doubt, Doubt.CAMERA))
         material = self._material(search)
         if material is None:
             return self._skipped(search)
@@ -200,7 +199,10 @@ class QueryStages:
         return replace(material, is_strong=True, unmatched=unmatched) if unmatched or not is_known else None
 
     def _rematched(self, search: Search) -> Search:
-        """Matches the photograph again with the next reference, or with as many as there are threads if it is alone."""
+        """Matches the photograph again with the next reference, or with as many as there are threads if it is alone.
+
+        If it matches none of the most promising references, which come first, it is matched with no others.
+        """
         material = search.material
         assert material is not None
         assert material.query_matches is not None
@@ -211,7 +213,11 @@ class QueryStages:
             found = matcher.rematch_together(material.view, [material.references[i] for i in indices])
         for i, it in zip(indices, found, strict=True):
             matches[i] = it
-        return replace(search, material=replace(material, query_matches=tuple(matches), unmatched=others))
+        rematched = (*material.rematched, *indices)
+        if not matcher.is_promising([matches[i] for i in rematched]):
+            others = ()
+        matched = replace(material, query_matches=tuple(matches), unmatched=others, rematched=rematched)
+        return replace(search, material=matched)
 
     def _matched(self, search: Search) -> SearchResult:
         """Matches the next reference, or goes on with the query if all are matched or no time is left for more."""
@@ -355,15 +361,18 @@ class QueryStages:
         return following
 
     def _climb(self, search: Search) -> SearchResult:
-        if search.verdict is None:  # near the prior there was none
+        verdict = search.verdict
+        if verdict is None:  # near the prior there was none
             first = search.to(ladder.AS_IT_IS, Attempt(), search.give_up_s, self._tiers[0].features)
             return self._next(first, first.first_step)
+        if verdict.doubts:
+            search = replace(search, angles_deg=choosing.rasters_in(search, search.angles_deg))
         features = self._verdicts.tier(search.attempt).features
         before = search.before or search.attempt
         now_s = time.monotonic()
         give_up_s = now_s + TIME_SHARE * (search.deadline_s - now_s)
-        situation, doubts = search.situation(self._tiers), search.verdict.doubts
-        following = ladder.further(before, search.best, search.tried, doubts, situation)
+        situation, doubts = search.situation(self._tiers), verdict.doubts
+        following = ladder.further(before, search.tried, doubts, situation)
         search, rungs = cutting.offered(search, following, lambda it: self._verdicts.tier(it).features)
         steps = [chosen.to(rung.name, it, give_up_s, features).first_step for chosen, rung, it in rungs]
         return self._next(steps[0].payload, *steps) if steps else self._done(search)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from mapless_server.engine.search import Material
 from mapless_server.method import ladder
 from mapless_server.method.bundle.estimate import PosedSupport
-from mapless_server.method.judge.answer import Localization
+from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.hints import hinted
 from mapless_server.method.judge.hypothesis import Attempt, Doubt, Found, Where
 from mapless_server.method.judge.judge import trust_in_scene
@@ -18,8 +18,8 @@ from mapless_server.scenes import ANYWHERE
 from mapless_server.store import SceneAttributes
 
 from . import tracking
-from .query import CutReason, Result, Tier
-from .search import Search
+from .query import CutReason, Result, Tier, Tried
+from .search import UNFINISHED, Search
 
 
 class Verdicts:
@@ -82,22 +82,13 @@ class Verdicts:
         result = self.result(search, chosen, search.materials[search.found.index(chosen)], verdict.outcome)
         ended = zip(search.attempts, search.tried, strict=True)
         attempts = tuple(replace(it, is_chosen=tried == chosen.attempt) for it, tried in ended)
-        return replace(result, attempts=attempts, cuts=search.cuts)
+        answer = _with_unfinished(result.answer, attempts)
+        return replace(result, answer=answer, attempts=attempts, cuts=search.cuts)
 
     def without_present(self, search: Search, outcome: str, reason: CutReason) -> Result:
         """The result without the present attempt, which ended so."""
-        assert search.verdict is not None
         features = self.tier(search.attempt).features
-        search = search.ended(outcome, features).cut(search.rung, features, reason)
-        answered = self.answer(search)
-        rejection = answered.answer.outcome
-        if isinstance(rejection, Rejection) and rejection.hint is not None:
-            # Without this, the hint would tell the caller to move although repeating the call may succeed.
-            untried = next((it.untried for it in ladder.RUNGS if it.name == search.rung), "as it is")
-            advice = f"Trying it {untried} was not finished: asking again, when less is asked, may help."
-            hint = replace(rejection.hint, message=f"{rejection.hint.message} {advice}")
-            answered = replace(answered, answer=replace(answered.answer, outcome=replace(rejection, hint=hint)))
-        return answered
+        return self.answer(search.ended(outcome, features).cut(search.rung, features, reason))
 
     def result(self, search: Search, found: Found, material: Material, outcome: Localization | Rejection) -> Result:
         """The result of an attempt with an outcome, whose hint says what would help."""
@@ -117,6 +108,17 @@ class Verdicts:
             search.attributes,
             search.seconds(self.tier(search.attempt).features),
         )
+
+
+def _with_unfinished(answer: Answer, attempts: Sequence[Tried]) -> Answer:
+    """Says in the hint of a rejection which attempt was not finished: repeating the call may then succeed."""
+    rejection, unfinished = answer.outcome, [it for it in attempts if it.outcome in UNFINISHED]
+    if not isinstance(rejection, Rejection) or rejection.hint is None or not unfinished:
+        return answer
+    untried = next((it.untried for it in ladder.RUNGS if it.name == unfinished[0].rung), "as it is")
+    advice = f"Trying it {untried} was not finished: asking again, when less is asked, may help."
+    hint = replace(rejection.hint, message=f"{rejection.hint.message} {advice}")
+    return replace(answer, outcome=replace(rejection, hint=hint))
 
 
 def _rejected(found: Found, rejection: Rejection, doubts: Doubt) -> Found:

@@ -22,7 +22,9 @@ class Situation:
         may_be_elsewhere: whether references elsewhere would be chosen without soft priors.
         has_place: whether the priors exclude one of two places that explain the photograph.
         can_match_strongly: for each features, whether a network can match them.
-        upright_only: whether the first features match nothing in a photograph that is turned.
+        any_roll: index of the features that match however the camera is rolled; None if there are none.
+        angles_deg: by how much to turn the photograph, clockwise, so that references are upright in one of its rasters;
+            empty if they are in the photograph as it is, or if that is unknown.
     """
 
     is_best: bool = True
@@ -31,7 +33,8 @@ class Situation:
     may_be_elsewhere: bool = False
     has_place: bool = False
     can_match_strongly: tuple[bool, ...] = (False,)
-    upright_only: bool = False
+    any_roll: int | None = None
+    angles_deg: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class Rung:
         needs: what it needs, in words.
         cost: what it computes again.
         untried: says in a rejection that it was not finished.
-        change: makes the attempt from the one before, and the one of the best pose so far; None for none.
+        change: makes the attempt from the one before.
         is_possible: whether an attempt can be changed so.
         is_cheap: whether it costs about as much as the first attempt, so that also those get it who have to wait for
             others.
@@ -57,7 +60,7 @@ class Rung:
     needs: str
     cost: str
     untried: str
-    change: Callable[[Attempt, Attempt | None], Attempt]
+    change: Callable[[Attempt, Situation], Attempt]
     is_possible: Callable[[Attempt, Situation], bool]
     is_cheap: bool = False
 
@@ -70,9 +73,18 @@ STRENGTHENED = (
 TRACKED, AS_IT_IS = "tracked", "as it is"
 
 
-def _stronger(before: Attempt, best: Attempt | None) -> Attempt:
-    raster = (Raster.AS_IS, 0.0) if best is None else (best.raster, best.angle_deg)
-    return Attempt(before.features + 1, *raster, Where.LIKELY if before.where is Where.ONE_PLACE else before.where)
+def _with_features(features: int, before: Attempt, situation: Situation) -> Attempt:
+    """Features of the photograph, turned if they must be upright and are known not to be."""
+    where = Where.LIKELY if before.where is Where.ONE_PLACE else before.where
+    if features == situation.any_roll or not situation.angles_deg:
+        return Attempt(features, where=where)
+    return Attempt(features, Raster.TURNED, situation.angles_deg, where)
+
+
+def _next_stronger(before: Attempt, situation: Situation) -> int:
+    """Index of the next stronger features after those of an attempt; those for any roll have a rung of their own."""
+    following = before.features + 1
+    return following + 1 if following == situation.any_roll else following
 
 
 def _on_points(attempt: Attempt, situation: Situation) -> bool:
@@ -81,14 +93,25 @@ def _on_points(attempt: Attempt, situation: Situation) -> bool:
 
 RUNGS = (
     Rung(
+        "mirrored",
+        "the photograph's mirror image is matched",
+        Doubt.STARVED | Doubt.CHANCE | Doubt.LOW_TRUST,
+        "features for any roll, which found no good pose",
+        "matches",
+        "mirrored",
+        lambda before, it: before.basis.but(raster=Raster.MIRRORED),
+        lambda before, it: before.features == it.any_roll and before.raster is Raster.AS_IS,
+        is_cheap=True,
+    ),
+    Rung(
         "rematched",
         "the photograph is matched by a network",
         STRENGTHENED,
         "a network that matches these features",
         "matches with each reference, a step of the queue each; structure and pose",
         "with matches of a network",
-        lambda before, _: before.basis.but(matching=Matching.STRONG),
-        lambda before, it: it.can_match_strongly[before.features] and before.raster is Raster.AS_IS,
+        lambda before, it: before.basis.but(matching=Matching.STRONG),
+        lambda before, it: it.can_match_strongly[before.features],
     ),
     Rung(
         "wide",
@@ -97,7 +120,7 @@ RUNGS = (
         "two references",
         "matches of pairs of references, which are stored; structure and pose",
         "with wide matches",
-        lambda before, _: before.but(matching=before.matching.widened, solver=Solver.POINTS),
+        lambda before, it: before.but(matching=before.matching.widened, solver=Solver.POINTS),
         _on_points,
         is_cheap=True,
     ),
@@ -108,7 +131,7 @@ RUNGS = (
         "two references",
         "a pose from epipolar lines",
         "from epipolar lines",
-        lambda before, _: before.but(matching=before.matching.widened, solver=Solver.LINES),
+        lambda before, it: before.but(matching=before.matching.widened, solver=Solver.LINES),
         _on_points,
         is_cheap=True,
     ),
@@ -119,7 +142,7 @@ RUNGS = (
         "priors that exclude the other place",
         "structure and pose",
         "with references of one of the places",
-        lambda before, _: before.basis.but(where=Where.ONE_PLACE),
+        lambda before, it: before.basis.but(where=Where.ONE_PLACE),
         lambda before, it: it.has_place,
         is_cheap=True,
     ),
@@ -130,19 +153,31 @@ RUNGS = (
         "soft priors that keep references out that resemble the photograph",
         "matches with other references, structure and pose",
         "with references of the whole scene",
-        lambda before, _: before.basis.but(where=Where.ANYWHERE),
+        lambda before, it: before.basis.but(where=Where.ANYWHERE),
         lambda before, it: it.may_be_elsewhere,
         is_cheap=True,
     ),
     Rung(
         "turned",
-        "features of the photograph turned as it matches most",
+        "features of the photograph turned until it is upright in the references",
         Doubt.STARVED | Doubt.CHANCE,
-        "first features that match only what is upright; clearly more matches turned",
-        "features four times, and all that follows",
-        "turned by 90, 180 and 270 degrees",
-        lambda before, _: before.basis.but(raster=Raster.TURNED),
-        lambda before, it: it.upright_only and before.features == 0 and before.raster is Raster.AS_IS,
+        "features that match only what is upright; a roll that matches, or priors, show",
+        "everything",
+        "turned",
+        lambda before, it: _with_features(0, before, it),
+        lambda before, it: bool(it.angles_deg) and it.any_roll != 0,
+        is_cheap=True,
+    ),
+    Rung(
+        "any roll",
+        "features that match however the camera is rolled",
+        STRENGTHENED,
+        "such features",
+        "everything",
+        "with features for any roll",
+        lambda before, it: _with_features(it.any_roll or 0, before, it),
+        lambda before, it: before.features < (it.any_roll or 0),
+        is_cheap=True,
     ),
     Rung(
         "stronger",
@@ -151,8 +186,8 @@ RUNGS = (
         "further features",
         "everything",
         "with stronger features",
-        _stronger,
-        lambda before, it: before.features + 1 < len(it.can_match_strongly),
+        lambda before, it: _with_features(_next_stronger(before, it), before, it),
+        lambda before, it: _next_stronger(before, it) < len(it.can_match_strongly),
     ),
 )
 """The rungs in the order in which they are tried, after the first attempt: near a pose prior, or as it is."""
@@ -169,13 +204,12 @@ def first_attempt(situation: Situation) -> tuple[str, Attempt]:
 
 
 def further(
-    before: Attempt, best: Attempt | None, tried: Collection[Attempt], doubts: Doubt, situation: Situation
+    before: Attempt, tried: Collection[Attempt], doubts: Doubt, situation: Situation
 ) -> Iterator[tuple[Rung, Attempt]]:
     """The attempts that can remove one of the doubts, in order.
 
     Args:
         before: the last attempt.
-        best: that of the best pose so far; None if none has a pose.
         tried: all attempts so far.
         doubts: what they leave in doubt.
         situation: on which rungs are possible.
@@ -183,6 +217,6 @@ def further(
     if Doubt.CAMERA in doubts:
         return
     for rung in RUNGS:
-        attempt = rung.change(before, best)
+        attempt = rung.change(before, situation)
         if rung.doubts & doubts and rung.is_possible(before, situation) and attempt not in tried:
             yield rung, attempt

@@ -12,7 +12,7 @@ from .bundle.priors import NO_PRIORS, Priors
 from .features.views import PosedView, View
 from .judge.answer import Answer
 from .judge.decide import Verdict, decide
-from .judge.hypothesis import Attempt, Found, Hypothesis
+from .judge.hypothesis import Attempt, Found
 from .options import DoubtOptions, LocalizeOptions, StageContext, Variant
 from .pipeline import Coarse, Pipeline, prepare, reconstruct
 from .rejection import Rejection
@@ -61,9 +61,8 @@ def attempts(coarse: Coarse, doubt: DoubtOptions) -> Iterator[tuple[Found, Verdi
         found.append(solve(coarse, attempt, doubt))
         verdict = decide(found, priors, prepared.unit)
         yield found[-1], verdict
-        best = verdict.chosen.attempt if isinstance(verdict.chosen, Hypothesis) else None
         tried = [it.attempt for it in found]
-        following = next(ladder.further(attempt, best, tried, verdict.doubts, situation), None)
+        following = next(ladder.further(attempt, tried, verdict.doubts, situation), None)
         if following is None:
             return
         attempt = following[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Sequence
+from functools import partial
 
 from mapless_server.cache import LruCache
 from mapless_server.errors import DataLoss, NotFound, RequestError
@@ -14,7 +15,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
-from .library import Loaded, ReferenceLibrary, load_usable
+from .library import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 
 log = logging.getLogger(__name__)
@@ -48,18 +49,22 @@ class SceneIndexes:
         """Memory of all indexes, bytes."""
         return self._cached.used
 
-    def entries(self, scene_key: SceneKey, context: StageContext) -> Entries:
+    def entries(self, scene_key: SceneKey, context: StageContext, waits: bool = True) -> Entries:
         """Returns the references of a scene as it is now.
 
         References without a descriptor are described now, one by one, and finished ones are kept if the context is
-        cancelled. A reference that cannot be described because it is damaged remains without a descriptor. NotFound if
-        there is no such scene (field "scene"); Abandoned if the context is cancelled.
+        cancelled; if `waits` is False they are described in the background, and FeaturesMissing is raised. A reference
+        that cannot be described because it is damaged remains without a descriptor. NotFound if there is no such scene
+        (field "scene"); Abandoned if the context is cancelled.
         """
         # Even if the scene is evicted meanwhile, this call continues with the same index.
         cached = self._get(scene_key)
         entries = self._refresh(scene_key, cached)
         while undescribed := cached.describable(entries):
             log.info("describing %d references of scene %s for retrieval", len(undescribed), scene_key)
+            if not waits:
+                self._describe_later(scene_key, cached, undescribed)
+                raise FeaturesMissing
             with context.stage("describe"):
                 for reference_id, key in undescribed:
                     self._describe(scene_key, cached, reference_id, key, context)
@@ -111,6 +116,15 @@ class SceneIndexes:
             return library.load(scene_key, some, extractor, context)
 
         return load_usable(load, reference_ids, (DataLoss, NotFound), report)[1]
+
+    def _describe_later(
+        self, scene_key: SceneKey, cached: _CachedIndex, undescribed: Sequence[tuple[str, str]]
+    ) -> None:
+        """Describes references in the background, one by one."""
+        for reference_id, key in undescribed:
+            if key not in cached.scheduled:
+                cached.scheduled.add(key)
+                self._library.later(partial(self._describe, scene_key, cached, reference_id, key, StageContext()))
 
     def _describe(
         self, scene_key: SceneKey, cached: _CachedIndex, reference_id: str, key: str, context: StageContext
@@ -165,7 +179,8 @@ class _CachedIndex:
     """An index, and the lock `updating` of the thread that updates it.
 
     `damaged_ids` are of references that are not in the index, of which some may have been deleted; `undescribable` are
-    keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged.
+    keys of references found damaged when they were to be described; those `scheduled` are described in the background;
+    of `reported_ids` the damage has been logged.
     """
 
     def __init__(self, index: SceneIndex) -> None:
@@ -173,6 +188,7 @@ class _CachedIndex:
         self.damaged_ids: set[str] = set()
         self.undescribable: set[str] = set()
         self.reported_ids: set[str] = set()
+        self.scheduled: set[str] = set()
         self.updating = threading.Lock()
 
     def describable(self, entries: Entries) -> list[tuple[str, str]]:

@@ -135,15 +135,19 @@ class ReferenceLibrary:
         if new:
             _log_describing(new, extractor)
         for record in new:
-            self._background.submit(self._describe_in_background, record, extractor)
+            self.later(partial(self._describe_all, [record], extractor, lambda: None))
 
-    def _describe_in_background(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
+    def later(self, describe: Callable[[], None]) -> None:
+        """Describes in the background, after what is to be described already."""
+        self._background.submit(self._in_background, describe)
+
+    def _in_background(self, describe: Callable[[], None]) -> None:
         if self._closing.is_set():
             return
         try:
-            self._describe_all([record], extractor, lambda: None)
+            describe()
         except Exception as error:  # a damaged or deleted reference must not keep the others from being described
-            log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_key, error)
+            log.warning("a reference is not described: %s", error)
 
     def _describe_all(
         self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor, check: Callable[[], None]

@@ -11,7 +11,7 @@ from mapless_server.choices import AUTO, BEST_VARIANTS, OFF, STORED
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine, check_tiers
-from mapless_server.engine.references import References
+from mapless_server.engine.references import References, Retrieval
 from mapless_server.engine.stages import Method
 from mapless_server.extras import install_hint
 from mapless_server.images import ImageLimits
@@ -51,14 +51,17 @@ log = logging.getLogger(__name__)
 WITHOUT_WEIGHTS = "sift"
 """The features that need nothing."""
 
-CPU_TIERS = ((BEST_VARIANTS["edgepoint2"], WITHOUT_WEIGHTS), ("aliked",))
-GPU_TIERS = (("aliked", BEST_VARIANTS["edgepoint2"], WITHOUT_WEIGHTS),)
+ANY_ROLL = WITHOUT_WEIGHTS
+"""The features that match however the camera is rolled; the others must be upright."""
+
+CPU_TIERS = ((BEST_VARIANTS["edgepoint2"], WITHOUT_WEIGHTS), (ANY_ROLL,), ("aliked",))
+GPU_TIERS = (("aliked", BEST_VARIANTS["edgepoint2"], WITHOUT_WEIGHTS), (ANY_ROLL,))
 """The features of `auto`, of each tier the best first, of which the first that can be used is; all licences are free.
 
 On a CPU EdgePoint2 costs half of SIFT and localizes from fewer references, farther apart. ALIKED answers where the
 first tier is in doubt: of 159 photographs, 120 of them with 3 to 5 references far apart, SIFT loses 16 at 0.1 s a
 photograph, ALIKED 3 at 1 to 3 s, and ALIKED after SIFT the same 3 though only 53 need it. On a GPU ALIKED is as fast,
-and is used alone.
+and is used first. SIFT follows upright features: it costs 0.3 s, matches what is rolled, and shows by how much.
 """
 
 CACHED_AUDIT_PAIRS = 2000
@@ -154,11 +157,17 @@ def engine_over(
         depths = DepthFinder(store.database, observed, kind)
     library = ReferenceLibrary(store, depths if any(tier.uses_depths for tier in tiers) else None)
     indexes = SceneIndexes(store, library, descriptor, first, options.index_cache_bytes)
+    retrievals = [Retrieval(descriptor, first, indexes)]
+    for tier in tiers[1:]:
+        if tier.any_roll:  # photographs that are rolled resemble references by these features alone
+            own, capacity_bytes = VladDescriptor.of(tier.extractor), options.index_cache_bytes
+            own_indexes = SceneIndexes(store, library, own, tier.extractor, capacity_bytes)
+            retrievals.append(Retrieval(own, tier.extractor, own_indexes))
     matcher = tiers[0].pipeline.matcher
     pairs = PairMatches(matcher.options.reference_ratio, CACHED_AUDIT_PAIRS, matcher.pairs.arithmetic)
     agreements = SceneAgreements(store, indexes, library, first, tiers[0].pipeline.matcher, observed)
     tools = SceneTools(library, indexes, descriptor, first, pairs)
-    references = References(tools, extractors, options.image_limits, agreements)
+    references = References(tools, retrievals, extractors, options.image_limits, agreements)
     engine = QueueEngine(tiers, references, options, observer, quota, method)
     maker = None
     if depth_network is not None:
@@ -203,13 +212,13 @@ def _background_matching(
 
 def feature_names(settings: Settings, device: str) -> tuple[str, ...]:
     """The features of the settings on "cpu" or "cuda...", the cheapest first; with `auto`, those with weights."""
-    return tuple(_present(_tiers(settings.features, device), settings))
+    return tuple(dict.fromkeys(_present(_tiers(settings.features, device), settings)))
 
 
 def _tiers(features: str, device: str) -> tuple[tuple[str, ...], ...]:
     """For each tier, the cheapest first, the features that it may use, the best first."""
     if features != AUTO:
-        return ((BEST_VARIANTS.get(features, features),),)
+        return ((BEST_VARIANTS.get(features, features),), (ANY_ROLL,))
     return CPU_TIERS if device == "cpu" else GPU_TIERS
 
 
@@ -243,7 +252,7 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     )
     uses_depths = settings.reference_depth != OFF and reconstructor.uses_correspondences
     return tuple(
-        Tier(extractor, Pipeline(reconstructor, matchers[name]), uses_depths, upright_only=name != "sift")
+        Tier(extractor, Pipeline(reconstructor, matchers[name]), uses_depths, any_roll=name == ANY_ROLL)
         for name, extractor in extractors.items()
     )
 
@@ -318,7 +327,7 @@ def _make_extractors(settings: Settings, device: str, missing: _Missing) -> dict
     for alternatives in _tiers(settings.features, device):
         for name in alternatives:
             try:
-                extractors[name] = _make_extractor(name, settings, device)
+                extractors[name] = extractors.get(name) or _make_extractor(name, settings, device)
                 break
             except (ImportError, WeightsMissing) as error:
                 if settings.features != AUTO:

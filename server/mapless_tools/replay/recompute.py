@@ -161,7 +161,14 @@ class RecordedSource:
         """Implements ReferenceSource."""
         return self.call.attributes
 
-    def choose(self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext) -> Choice:
+    def choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        selection: Selection,
+        context: StageContext,
+        extractor: FeatureExtractor | None = None,
+    ) -> Choice:
         """The captured choice; of references near a prior only if it was so chosen. DamagedCapture if there is none."""
         if selection.near is not None and (self.part.choice is None or self.part.choice.descriptor != POSE_PRIOR):
             return Choice((), POSE_PRIOR, self.part.generation)

@@ -66,10 +66,10 @@ def test_a_mask_of_everything_leaves_nothing() -> None:
     assert len(SiftExtractor().extract(IMAGE, CAMERA, everything).features) == 0
 
 
-@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
-def test_a_mask_turns_with_its_photograph(quarter_turns: int) -> None:
-    view = extract_turned(SiftExtractor(), IMAGE, CAMERA, quarter_turns, left_half())
+@pytest.mark.parametrize("angle_deg", [0.0, 40.0, 90.0, 180.0, 270.0, 301.5])
+def test_a_mask_turns_with_its_photograph(angle_deg: float) -> None:
+    view = extract_turned(SiftExtractor(), IMAGE, CAMERA, [angle_deg], left_half())
     assert len(view.features) > 100
     assert view.features.keypoints[:, 0].min() > CAMERA.width_px // 2 - 1 + MARGIN_PX - 0.5
-    if quarter_turns == 0:
+    if angle_deg == 0:
         assert_same_view(view, SiftExtractor().extract(IMAGE, CAMERA, left_half()))

@@ -1,11 +1,11 @@
 """Decides which of all results of a photograph's attempts is its answer: one rule for all of them.
 
-All poses that were found, accepted or not, are scored on the same matches (`pose.relative.score`): all that the
-strongest features tried have with any reference, each reference's once. Poses near one another are one place, whose
-score is that of its best pose. The place with the best score is answered, by its accepted pose with the best score or
-by what was found wrong with its poses, if it has 1.5 times the score of any other. Otherwise priors decide if they
-exclude all places but one; if they do not, the photograph is ambiguous. PoseLib's RANSAC loop does the same with
-samples: generate models, score all of them on the same data, keep the best.
+All poses that were found, accepted or not, are scored on the same matches (`pose.relative.score`): all that any of the
+features tried have with any reference. Poses near one another are one place, whose score is that of its best pose. The
+place with the best score is answered, by its accepted pose with the best score or by what was found wrong with its
+poses, if it has 1.5 times the score of any other. Otherwise priors decide if they exclude all places but one; if they
+do not, the photograph is ambiguous. PoseLib's RANSAC loop does the same with samples: generate models, score all of
+them on the same data, keep the best.
 """
 
 import math
@@ -230,17 +230,15 @@ class _Scored:
 
 
 def _matches(found: Sequence[Found]) -> Iterator[_Scored]:
-    """All matches of the strongest features that have any, each reference's once.
-
-    Features of the photograph turned are others than of it as it is.
-    """
-    supports = [(it.attempt, it.answer.support) for it in found if it.answer.support is not None]
-    strongest = max((attempt.features for attempt, _ in supports), default=0)
-    seen: set[tuple[Raster, float, str]] = set()
-    for attempt, support in reversed(supports):
-        keys = [(attempt.raster, attempt.angle_deg, it.key) for it in support.references]
+    """All matches with any reference, those of each features once: of the photograph turned they are others."""
+    seen: set[tuple[int, Raster, tuple[float, ...], str]] = set()
+    for result in reversed(found):
+        attempt, support = result.attempt, result.answer.support
+        if support is None:
+            continue
+        keys = [(attempt.features, attempt.raster, attempt.angles_deg, it.key) for it in support.references]
         is_new = np.array([key not in seen for key in keys])
-        if attempt.features == strongest and is_new.any():
+        if is_new.any():
             seen.update(keys)
             yield _Scored.of(support, is_new)
 

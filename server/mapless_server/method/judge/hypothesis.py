@@ -23,6 +23,8 @@ class Raster(Enum):
     AS_IS = "as is"
     REDUCED = "reduced"
     TURNED = "turned"
+    MIRRORED = "mirrored"
+    """Exchanged left and right: what matches so has no pose."""
 
 
 class Where(Enum):
@@ -53,7 +55,7 @@ class Attempt:
     Attributes:
         features: index of the features, the cheapest first.
         raster: where they are found in the photograph.
-        angle_deg: by how much the raster is turned clockwise.
+        angles_deg: by how much the raster is turned clockwise; several if references are rolled against one another.
         where: which references are used.
         matching: how the photographs are matched.
         solver: which matches give the pose.
@@ -61,7 +63,7 @@ class Attempt:
 
     features: int = 0
     raster: Raster = Raster.AS_IS
-    angle_deg: float = 0.0
+    angles_deg: tuple[float, ...] = ()
     where: Where = Where.LIKELY
     matching: Matching = Matching.STRICT
     solver: Solver = Solver.POINTS
@@ -69,7 +71,7 @@ class Attempt:
     @property
     def basis(self) -> "Attempt":
         """The attempt whose photographs and features it uses: attempts of one basis differ in what follows."""
-        return Attempt(self.features, self.raster, self.angle_deg, self.where)
+        return Attempt(self.features, self.raster, self.angles_deg, self.where)
 
     def but(self, **changes: object) -> "Attempt":
         """A copy with these values."""

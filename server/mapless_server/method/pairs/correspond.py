@@ -287,6 +287,12 @@ class Matcher:
         best_first = sorted(range(len(matches)), key=lambda i: -len(matches[i]))
         return best_first[: self.options.rematched_references]
 
+    def is_promising(self, rematched: Sequence[Matches]) -> bool:
+        """Whether to match further references after these, the best first, which `rematch` has matched."""
+        options = self.options
+        is_tried = len(rematched) >= options.promising_references
+        return not is_tried or max(map(len, rematched)) >= options.promising_matches
+
     def rematch(self, query: View, reference: PosedView) -> Matches:
         """Matches a query with one reference by the `pair_matching`."""
         assert self.pair_matching is not None

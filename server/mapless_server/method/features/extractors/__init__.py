@@ -5,7 +5,7 @@ features must change the name. The learned extractors import torch, only when th
 """
 
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from .sift import SiftExtractor, SiftOptions
 __all__ = [
     "FEATURES",
     "FeatureExtractor",
+    "Mirrors",
     "SiftExtractor",
     "SiftOptions",
     "make_extractor",
@@ -38,6 +39,15 @@ class FeatureExtractor(Protocol):
 
         The camera has the same size; `ignored` are pixels, at any size, near which no feature is found, see `masks`.
         """
+        ...
+
+
+@runtime_checkable
+class Mirrors(Protocol):
+    """Knows the features of a photograph's mirror image from those of the photograph."""
+
+    def mirrored(self, view: View) -> View:
+        """The view with the descriptors of the mirror image at the same pixels."""
         ...
 
 

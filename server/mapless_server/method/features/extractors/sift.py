@@ -1,7 +1,7 @@
 """SIFT features: no weights, no torch; the default where there are no weights."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -71,6 +71,16 @@ class SiftExtractor:
             raw.astype(np.uint8),  # whole numbers
             np.array([k.size for k in found], np.float32),
         )
+
+    def mirrored(self, view: View) -> View:
+        """See Mirrors: no features are found again.
+
+        A histogram has 4 rows and 4 columns of cells about the keypoint's orientation, with 8 directions each. Mirrored
+        about the orientation, the rows and the directions are in reverse.
+        """
+        cells = view.features.descriptors.reshape(-1, 4, 4, 8)
+        reverse = np.ascontiguousarray(cells[:, ::-1, :, -np.arange(8) % 8], np.uint8)
+        return replace(view, features=replace(view.features, descriptors=reverse.reshape(-1, 128)))
 
     def _described(
         self, sift: cv2.SIFT, image: NDArray[np.uint8], usable: NDArray[np.bool_]

@@ -1,0 +1,112 @@
+"""How photographs are rolled against one another, and the rasters in which features that must be upright match them.
+
+The roll of a photograph against a reference is the angle, clockwise, by which its raster has to be turned so that what
+both show is upright in both alike. Features that match however the camera is rolled show it; so do poses.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from mapless.geometry import Array
+
+from .views import Matches, View
+
+UPRIGHT_DEG = 20.0
+"""Learned features still match what is rolled by so much: EdgePoint2 1353 of 2048 at 15 degrees, 377 at 30."""
+
+MAX_RASTERS = 3
+"""A photograph is turned in so many ways at most, since each costs as much as the photograph as it is."""
+
+NEAR_SHARE = 0.05
+"""Matches agree with a similarity of two images that are so near it, as a share of the width."""
+
+LEAST_ACROSS = 0.5
+"""A direction shows the roll of a camera if so much of its unit vector is across the optical axis."""
+
+LEAST_AGREEMENT = 2.8
+"""Matches show a roll if they have at least this agreement. Evidence: rungs-worth."""
+
+
+class Similarity(NamedTuple):
+    """What matches of a photograph and a reference have in common: a turn, a scale and a shift of their images.
+
+    Attributes:
+        clockwise_deg: the roll of the photograph against the reference.
+        agreeing: number of matches that are near the similarity.
+        count: number of all matches.
+    """
+
+    clockwise_deg: float
+    agreeing: int
+    count: int
+
+    @property
+    def agreement(self) -> float:
+        """How little like chance it is: wrong matches lie where there is texture, so that some agree, too.
+
+        Those of photographs of different places reach about two, whatever their number.
+        """
+        return self.agreeing / math.sqrt(self.count)
+
+
+def similarity_of(query: View, reference: View, matches: Matches) -> Similarity | None:
+    """The similarity that most matches agree with, by RANSAC; None without any.
+
+    Depth and perspective make right matches agree only roughly.
+    """
+    if len(matches) < 4:
+        return None
+    ours, theirs = query.features.pixels(matches[:, 0]), reference.features.pixels(matches[:, 1])
+    near_px = NEAR_SHARE * reference.camera.width_px
+    found, inliers = cv2.estimateAffinePartial2D(
+        ours[:, None], theirs[:, None], method=cv2.RANSAC, ransacReprojThreshold=near_px, maxIters=500
+    )
+    if not inliers.any():
+        return None
+    return Similarity(math.degrees(math.atan2(found[1, 0], found[0, 0])), int(inliers.sum()), len(matches))
+
+
+def roll_of_rotation(reference_from_query: Array) -> float:
+    """The roll, degrees clockwise, of a camera by its rotation (3, 3) in another's frame: that about the optical axis.
+
+    Swing-twist decomposition: the twist about z is what is left when the optical axis is turned the shortest way.
+    """
+    r = reference_from_query
+    return math.degrees(math.atan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1]))
+
+
+def roll_of_directions(in_query: Array, in_reference: Array) -> float | None:
+    """The roll, degrees clockwise, of a direction (3,) seen in two cameras; None where one looks along it."""
+    if min(np.hypot(*in_query[:2]), np.hypot(*in_reference[:2])) < LEAST_ACROSS:
+        return None
+    return math.degrees(math.atan2(in_reference[1], in_reference[0]) - math.atan2(in_query[1], in_query[0]))
+
+
+def roll_about_axis(roll_deg: float) -> Array:
+    """The rotation (3, 3) of a camera rolled by so much in the other's frame, both with the same optical axis."""
+    cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def rasters_of(rolls_deg: Sequence[float], counts: Sequence[int]) -> tuple[float, ...]:
+    """The angles, degrees clockwise in [0, 360), by which to turn a photograph with these rolls to references.
+
+    The references with the most matches come first; each is upright in a raster, if the largest number of rasters
+    suffices. Empty if all are upright in the photograph as it is.
+    """
+    chosen: list[float] = []
+    for i in np.argsort(-np.asarray(counts), kind="stable"):
+        roll_deg = float(rolls_deg[i])
+        if all(apart_deg(roll_deg, it) > 2 * UPRIGHT_DEG for it in chosen):
+            chosen.append(0.0 if apart_deg(roll_deg, 0.0) <= UPRIGHT_DEG else float(round(roll_deg)) % 360)
+    chosen = chosen[:MAX_RASTERS]
+    return () if chosen == [0.0] else tuple(chosen)
+
+
+def apart_deg(first_deg: float, second_deg: float) -> float:
+    """The angle between two directions, 0 to 180 degrees."""
+    return abs((first_deg - second_deg + 180) % 360 - 180)
