@@ -37,12 +37,12 @@ class Similarity(NamedTuple):
     Attributes:
         clockwise_deg: the roll of the photograph against the reference.
         agreeing: number of matches that are near the similarity.
-        count: number of all matches.
+        total: number of all matches.
     """
 
     clockwise_deg: float
     agreeing: int
-    count: int
+    total: int
 
     @property
     def agreement(self) -> float:
@@ -50,7 +50,7 @@ class Similarity(NamedTuple):
 
         Those of photographs of different places reach about two, whatever their number.
         """
-        return self.agreeing / math.sqrt(self.count)
+        return self.agreeing / math.sqrt(self.total)
 
 
 def similarity_of(query: View, reference: View, matches: Matches) -> Similarity | None:
