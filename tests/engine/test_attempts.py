@@ -183,5 +183,5 @@ def test_a_photograph_of_a_group_keeps_the_matches_it_has(setting: Setting, is_p
     search = replace(begun, found=found, materials=(material,) * 2, tried=attempts, verdict=verdict)
     search = replace(search, attempts=tuple(Tried(str(i), "", "", 0.0, 0.0) for i in range(2)))
     answer = Verdicts(setting.tiers, DoubtOptions()).answer(search).answer
-    assert answer.outcome is cause
+    assert answer.outcome == cause
     assert answer.support is (support if is_part else None)
