@@ -109,8 +109,7 @@ def test_it_is_in_the_callers_axes_with_its_session(client: Client) -> None:
 
 
 def test_no_answer_before_the_last_is_such_a_pose(client: Client) -> None:
-    options = {"mask": MASK, "include_imprecise_pose": True}
-    (only,) = client.localize_progressively(PHOTO, corner.CAMERA, "corner", **options)
+    (only,) = client.localize_progressively(PHOTO, corner.CAMERA, "corner", mask=MASK, include_imprecise_pose=True)
     the_pose(only)
 
 
@@ -122,8 +121,10 @@ def test_a_localized_photograph_has_none(client: Client) -> None:
 def test_what_else_speaks_against_it_takes_it_away(client: Client) -> None:
     """Too little evidence for the coverage, and a limit that leaves the references, but not the pose."""
     limit = PositionPrior(corner.pose(0.0).translation, radius_m=0.3)
-    for changed in ({"coverage": 0.001}, {"priors": Priors(position=limit)}):
-        answer = client.localize(PHOTO, corner.CAMERA, "corner", mask=MASK, include_imprecise_pose=True, **changed)
+    for coverage, priors in ((0.001, Priors()), (0.0, Priors(position=limit))):
+        answer = client.localize(
+            PHOTO, corner.CAMERA, "corner", mask=MASK, include_imprecise_pose=True, coverage=coverage, priors=priors
+        )
         assert isinstance(answer, Rejected)
         assert answer.hypotheses == ()
 

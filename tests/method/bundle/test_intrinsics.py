@@ -22,7 +22,8 @@ from mapless_server.method.bundle.intrinsics import (
 )
 from mapless_server.method.bundle.pose_problem import AdjustInput, AdjustOptions, pose_problem, with_intrinsics
 from mapless_server.method.bundle.priors import IntrinsicsSigma
-from mapless_server.method.features.views import undistort_pixels
+from mapless_server.method.features.views import View, undistort_pixels
+from mapless_server.method.judge import cameras
 from mapless_server.method.judge.answer import Answer
 from mapless_server.method.judge.cameras import intrinsics_checks, wrong_camera, wrong_intrinsics
 from mapless_server.method.judge.hints import hinted
@@ -483,6 +484,17 @@ def test_a_rejection_without_a_pose_names_its_camera_likewise(count: int | None,
         assert check.estimated == pytest.approx(true.focal_x_px, rel=0.1)
     else:
         assert outcome.intrinsics_checks == ()
+
+
+def test_a_camera_that_sees_no_keypoint_fits_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As that of a lens so strong that none of the photograph's pixels is one of its."""
+
+    def blind(view: View, camera: Camera) -> View:
+        keypoints = np.full_like(view.features.keypoints, np.nan)
+        return replace(view, camera=camera.pinhole(), features=replace(view.features, keypoints=keypoints))
+
+    monkeypatch.setattr(cameras, "read_as", blind)
+    assert rejection_of(focal=2.0)[0] is None
 
 
 def test_a_camera_that_nothing_doubts_is_not_compared() -> None:
