@@ -10,5 +10,6 @@ support, and for one that is turned, and which of them does it answer? Data: the
 `other-place` asks photographs of every place in the others (`--in-process`: many more, by the method's own modules),
 `doubtful` asks those of `doubtful.json`, which cost over two seconds when that list was made (`--list` makes it),
 `turned` asks photographs turned about the optical axis (`turning.py`). `--store FOLDER` keeps the server's store, so
-that a later run does not wait for the work in the background.
+that a later run does not wait for the work in the background, which takes half an hour for all places; what is missing
+of it is made, unless MAPLESS_BACKGROUND_MATCHING is false.
 """

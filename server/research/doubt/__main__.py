@@ -6,13 +6,24 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 from mapless_tools.output_files import check_writable, markdown_table, write_json
 from research.contradictions.asking import Row
 from research.contradictions.places import place_reader
 
-from .cases import ANGLES_DEG, EXPENSIVE_S, LIST, candidates, doubtful, other_places, turned_photographs, write_list
+from .cases import (
+    ANGLES_DEG,
+    CROSSED_REFERENCES,
+    EXPENSIVE_S,
+    LIST,
+    candidates,
+    doubtful,
+    other_places,
+    turned_photographs,
+    write_list,
+)
 from .in_process import QUERIES, accepted
 from .serving import answers
 from .tables import by, by_angle
@@ -30,10 +41,13 @@ def main() -> None:
     parser.add_argument("--store", type=Path, help="folder of a store that remains, for later runs")
     parser.add_argument("--list", action="store_true", help=f"doubtful: all candidates; writes {LIST.name}")
     parser.add_argument("--in-process", action="store_true", help="other-place: 2,000 queries without a server")
+    count = f"other-place: references of each place; default: {CROSSED_REFERENCES}"
+    parser.add_argument("--references", type=int, default=CROSSED_REFERENCES, metavar="N", help=count)
     parser.add_argument("--print", action="store_true", help="print the table of an existing file, and ask nothing")
     arguments = parser.parse_args()
-    if arguments.every < 1:
-        parser.error(f"--every must be at least 1, is {arguments.every}")
+    for option, bound in (("every", 1), ("references", 2)):
+        if getattr(arguments, option) < bound:
+            parser.error(f"--{option} must be at least {bound}, is {getattr(arguments, option)}")
     if not arguments.print and arguments.scenes is None:
         parser.error("give SCENES")
     for option, what in (("list", "doubtful"), ("in_process", "other-place")):
@@ -58,8 +72,12 @@ def measure(arguments: argparse.Namespace) -> Sequence[Row]:
     if arguments.in_process:
         return ask(accepted(arguments.scenes, QUERIES // arguments.every), arguments.json)
     of = place_reader(arguments.scenes)
-    kinds = {"other-place": other_places, "doubtful": doubtful, "turned": turned_photographs}
-    asked = list((candidates if arguments.list else kinds[arguments.what])(of))
+    asked_of = {
+        "other-place": partial(other_places, references=arguments.references),
+        "doubtful": candidates if arguments.list else doubtful,
+        "turned": turned_photographs,
+    }
+    asked = list(asked_of[arguments.what](of))
     # Whole photographs: one that is asked turned, is asked at every angle.
     each = len(ANGLES_DEG) if arguments.what == "turned" else 1
     asked = [it for i, it in enumerate(asked) if i // each % arguments.every == 0]

@@ -38,15 +38,15 @@ class Asked:
     fields: Mapping[str, str | int] = field(default_factory=dict)
 
 
-def other_places(of: PlaceOf, count: int = CROSSED) -> Iterator[Asked]:
-    """Photographs of each folder, evenly spread, asked in folders of other places."""
-    pairs = crossed(count)
+def other_places(of: PlaceOf, references: int = CROSSED_REFERENCES) -> Iterator[Asked]:
+    """Photographs of each folder, evenly spread, asked in folders of other places with so many references."""
+    pairs = crossed(CROSSED)
     photographs = {}
     for folder, times in Counter(folder for folder, _ in pairs).items():
-        frames = spread(of(folder, CROSSED_REFERENCES).dataset.frames, times)
+        frames = spread(of(folder, references).dataset.frames, times)
         photographs[folder] = islice(_endlessly(frames), times)
     for folder, at in pairs:
-        place, frame = of(at, CROSSED_REFERENCES), next(photographs[folder])
+        place, frame = of(at, references), next(photographs[folder])
         case = _case("other-place", place, frame, f"{folder}: {frame.name} in {place.scene}", Expected.REJECTED)
         yield Asked(replace(case, true_pose=None), {"photographed": folder, "folder": at})
 
