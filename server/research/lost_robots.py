@@ -85,9 +85,9 @@ class SharedCores:
                 heapq.heappop(self._events)[2]()
             self.scheduler.expire(self.now_s)
             for is_low in (False, True):
-                while (batch := self.scheduler.take("host", self.now_s, is_low)) is not None:
-                    self._left_s[batch] = batch.jobs[0].step.payload[0]
-                    self._weights[batch] = LOW_WEIGHT if is_low else 1.0
+                while (taken := self.scheduler.take("host", self.now_s, is_low)) is not None:
+                    self._left_s[taken] = taken.jobs[0].step.payload[0]
+                    self._weights[taken] = LOW_WEIGHT if is_low else 1.0
 
     def _speeds(self) -> dict[Batch, float]:
         """Of each thread: its share of the cores by its weight, and at most one core."""
