@@ -49,7 +49,7 @@ def climbed(doubts: Doubt, situation: Situation) -> list[str]:
         (
             Doubt.STARVED,
             Situation(can_match_strongly=(False, False, True), any_roll=1),
-            ["wide", "lines", "any roll", *("mirrored", "wide", "lines"), "stronger", *("rematched", "wide", "lines")],
+            ["wide", "lines", "any roll", *("mirrored", "wide"), "stronger", *("rematched", "wide", "lines")],
         ),
     ],
 )

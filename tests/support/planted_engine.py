@@ -19,6 +19,7 @@ from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.judge import JudgeOptions
 from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.promise import PromiseOptions
 from mapless_server.method.rejection import Hint, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing, Sphere
 from mapless_server.scheduling import Flow
@@ -28,7 +29,7 @@ from mapless_server.store import Store
 from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
-DOUBT = DoubtOptions(trust=0.1, radius_m=0.2, inliers=0)
+DOUBT = DoubtOptions(trust=0.1, radius_m=0.2, inliers=0, promise=PromiseOptions(least_gain_per_s=0.0))
 
 
 SCENE = SceneKey("s")

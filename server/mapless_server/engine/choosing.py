@@ -16,6 +16,7 @@ from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
 from mapless_server.method.features.rolls import (
     LEAST_AGREEMENT,
+    Similarity,
     rasters_of,
     roll_about_axis,
     roll_of_directions,
@@ -59,7 +60,7 @@ def described_anew(search: Search, tier: Tier) -> Material | None:
         return None
     views = search.views.in_form(RasterForm(attempt.angles_deg))
     found = _chosen(search, views, tier) if query.chooses else _named(search, views, tier)
-    if tier.pipeline.matcher.pair_matching is None or found.query_matches is not None:
+    if found.query_matches is not None:
         return found
     with search.context.stage("correspond"):
         matches = tier.pipeline.matcher.match_quickly(found.view, found.references, search.context.check)
@@ -80,24 +81,29 @@ def load_chosen(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loa
     return load_usable(lambda some: _load(search, some, tier), reference_ids, (DataLoss,), report)
 
 
-def rasters_in(search: Search, known_deg: tuple[float, ...]) -> tuple[float, ...]:
+def compared(search: Search) -> Search:
+    """The search with what the matches of its attempt show: how much they agree, and how the photograph is rolled."""
+    material = search.material
+    if material is None or not material.query_matches or any(it is material for it in search.materials[:-1]):
+        return search
+    pairs = zip(material.references, material.query_matches, strict=True)
+    found = [similarity_of(material.view, reference.view, matches) for reference, matches in pairs]
+    agreement = max((it.agreement for it in found if it is not None), default=0.0)
+    search = replace(search, agreement=max(search.agreement, agreement))
+    is_upright = search.attempt.raster is Raster.AS_IS
+    return replace(search, angles_deg=_rasters_by(search, material, found)) if is_upright else search
+
+
+def _rasters_by(search: Search, material: Material, found: Sequence[Similarity | None]) -> tuple[float, ...]:
     """By how much to turn the photograph, clockwise, so that references are upright in one of its rasters.
 
     Matches with the photograph as it is show how it is rolled against references, those for any roll best; references
     without enough matches are rolled against the others as their poses say. Where matches show nothing, priors may.
 
-    Args:
-        search: after an attempt.
-        known_deg: what earlier attempts have shown.
-
     Returns:
         The angles, degrees; empty if references are upright in the photograph as it is, or nothing shows that.
     """
-    material, attempt = search.material, search.attempt
-    if material is None or not material.query_matches or attempt.raster is not Raster.AS_IS:
-        return known_deg
-    references, matches = material.references, material.query_matches
-    found = [similarity_of(material.view, it.view, of) for it, of in zip(references, matches, strict=True)]
+    references = material.references
     shown = [it if it is not None and it.agreement >= LEAST_AGREEMENT else None for it in found]
     counts = [it.agreeing if it else 0 for it in shown]
     best = int(np.argmax(counts))
@@ -106,7 +112,7 @@ def rasters_in(search: Search, known_deg: tuple[float, ...]) -> tuple[float, ...
         by_pose = (roll_of_rotation(it.world_from_camera.rotation.T @ world_from_query) for it in references)
         rolls = [it.clockwise_deg if it else other for it, other in zip(shown, by_pose, strict=True)]
         return rasters_of(rolls, counts)
-    return known_deg or rasters_of(*_rolls_by_priors(search, references))
+    return search.angles_deg or rasters_of(*_rolls_by_priors(search, references))
 
 
 def _rolls_by_priors(search: Search, references: Sequence[PosedView]) -> tuple[list[float], list[int]]:

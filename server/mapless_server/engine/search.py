@@ -12,7 +12,7 @@ from mapless_server.engine.query import QueryViews
 from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.judge.hypothesis import Attempt, Where
 from mapless_server.method.ladder import Situation, first_attempt
-from mapless_server.method.options import StageContext, Variant
+from mapless_server.method.options import StageContext
 from mapless_server.method.rejection import PoseHypothesis
 from mapless_server.scenes import Choice
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
@@ -21,13 +21,9 @@ from mapless_server.store import SceneAttributes
 from .query import PREPARE, REFINE, CutReason, LadderCut, Query, ReferenceSource, Result, Tried
 
 if TYPE_CHECKING:  # services need not load what computes
-    from collections.abc import Sequence
-
     from mapless_server.method.judge.decide import Verdict
     from mapless_server.method.judge.hypothesis import Found
     from mapless_server.method.pipeline import Coarse, Prepared
-
-    from .query import Tier
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +125,7 @@ class Search:
         prepared: the photographs' matches, for the stage `coarse`.
         coarse: the reconstruction that attempts of the material's basis begin with.
         angles_deg: by how much to turn the photograph, see `Situation`.
+        agreement: the largest of its matches with a reference so far, see `features.rolls`.
     """
 
     query: Query
@@ -160,6 +157,7 @@ class Search:
     prepared: Prepared | None = None
     coarse: Coarse | None = None
     angles_deg: tuple[float, ...] = ()
+    agreement: float = 0.0
 
     @classmethod
     def begin(
@@ -173,21 +171,6 @@ class Search:
         """The search at its first attempt."""
         rung, attempt = first_attempt(Situation(can_be_tracked=query.can_be_tracked))
         return cls(query, source, views, deadline_s, on_better, rung, attempt)
-
-    def situation(self, tiers: Sequence[Tier]) -> Situation:
-        """On which the rungs after the present attempt depend."""
-        query, material, verdict = self.query, self.material, self.verdict
-        can_be_elsewhere = material is not None and material.choice is not None and not query.is_part
-        place = None if verdict is None else verdict.place
-        return Situation(
-            is_best=query.options.variant is Variant.BEST,
-            reference_count=0 if material is None or self.coarse is None else len(material.references),
-            may_be_elsewhere=can_be_elsewhere and query.narrowing.has_likely,
-            has_place=place is not None and material is not None and len(place.references) < len(material.references),
-            can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),
-            any_roll=next((i for i, it in enumerate(tiers) if it.any_roll), None),
-            angles_deg=self.angles_deg,
-        )
 
     def ended(self, outcome: str, features: str, has_result: bool = False) -> Search:
         """The search after the present attempt, which took the time since it began."""

@@ -40,6 +40,7 @@ from . import choosing, cutting, tracking
 from .failures import failure_of
 from .query import COARSE, PREPARE, REFINE, TRACK, CutReason, LadderCut, Result, Tier
 from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
+from .situation import situation_of
 from .verdicts import Verdicts, attributes_of
 
 log = logging.getLogger(__name__)
@@ -340,7 +341,7 @@ class QueryStages:
             raise ArithmeticError(f"the method's answer is not finite: {found.answer.outcome}, {found.answer.scale}")
         search.context.stage_seconds.update(found.answer.stage_seconds)
         found = self._verdicts.within_limits(search, found)
-        may_be_elsewhere = search.situation(self._tiers).may_be_elsewhere
+        may_be_elsewhere = situation_of(search, self._tiers, self._doubt.promise).may_be_elsewhere
         if may_be_elsewhere and choosing.resembles_elsewhere(search, found, self._verdicts.tier(search.attempt)):
             found = replace(found, doubts=found.doubts | Doubt.LIKE_ELSEWHERE)
         outcome, material = found.answer.outcome, search.material or search.materials[-1]
@@ -366,12 +367,12 @@ class QueryStages:
             first = search.to(ladder.AS_IT_IS, Attempt(), search.give_up_s, self._tiers[0].features)
             return self._next(first, first.first_step)
         if verdict.doubts:
-            search = replace(search, angles_deg=choosing.rasters_in(search, search.angles_deg))
+            search = choosing.compared(search)
         features = self._verdicts.tier(search.attempt).features
         before = search.before or search.attempt
         now_s = time.monotonic()
         give_up_s = now_s + TIME_SHARE * (search.deadline_s - now_s)
-        situation, doubts = search.situation(self._tiers), verdict.doubts
+        situation, doubts = situation_of(search, self._tiers, self._doubt.promise), verdict.doubts
         following = ladder.further(before, search.tried, doubts, situation)
         search, rungs = cutting.offered(search, following, lambda it: self._verdicts.tier(it).features)
         steps = [chosen.to(rung.name, it, give_up_s, features).first_step for chosen, rung, it in rungs]

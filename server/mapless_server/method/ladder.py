@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from .judge.hypothesis import Attempt, Doubt, Raster, Solver, Where
 from .pairs.pair import Matching
+from .promise import PROMISE, UNKNOWN, Known, PromiseOptions
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class Situation:
         any_roll: index of the features that match however the camera is rolled; None if there are none.
         angles_deg: by how much to turn the photograph, clockwise, so that references are upright in one of its rasters;
             empty if they are in the photograph as it is, or if that is unknown.
+        known, promise: what is known of the photograph, and when an attempt is worth its time by that.
     """
 
     is_best: bool = True
@@ -35,6 +37,8 @@ class Situation:
     can_match_strongly: tuple[bool, ...] = (False,)
     any_roll: int | None = None
     angles_deg: tuple[float, ...] = ()
+    known: Known = UNKNOWN
+    promise: PromiseOptions = PROMISE
 
 
 @dataclass(frozen=True)
@@ -206,7 +210,7 @@ def first_attempt(situation: Situation) -> tuple[str, Attempt]:
 def further(
     before: Attempt, tried: Collection[Attempt], doubts: Doubt, situation: Situation
 ) -> Iterator[tuple[Rung, Attempt]]:
-    """The attempts that can remove one of the doubts, in order.
+    """The attempts that can remove one of the doubts, and are worth their time, in order.
 
     Args:
         before: the last attempt.
@@ -219,4 +223,7 @@ def further(
     for rung in RUNGS:
         attempt = rung.change(before, situation)
         if rung.doubts & doubts and rung.is_possible(before, situation) and attempt not in tried:
-            yield rung, attempt
+            at_any_roll = attempt.features == situation.any_roll and attempt.features == before.features
+            name = f"{rung.name} at any roll" if at_any_roll else rung.name
+            if situation.known.is_worth(name, situation.promise):
+                yield rung, attempt

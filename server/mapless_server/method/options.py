@@ -12,6 +12,7 @@ from enum import Enum
 from mapless_server.bounds import check_bounds
 
 from .bundle.priors import IntrinsicsSigma
+from .promise import PROMISE, PromiseOptions
 
 
 class Variant(str, Enum):
@@ -67,11 +68,13 @@ class DoubtOptions:
             these among them; below 0.2 it tries 335, 109 of these among them.
         radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.
         inliers: a pose with fewer inliers is doubtful. Wide correspondences do not help above a hundred inliers.
+        promise: when a further attempt at a photograph in doubt is worth its time.
     """
 
     trust: float = 0.25
     radius_m: float = 0.2
     inliers: int = 100
+    promise: PromiseOptions = PROMISE
 
     def __post_init__(self) -> None:
         check_bounds(self, "trust radius_m inliers", at_least=0)

@@ -66,12 +66,14 @@ class Verdict:
         outcome: the pose, or why there is none.
         doubts: why another attempt could change it.
         place: the place that the priors decide for, if the chosen attempt alone cannot tell it from another.
+        kinds: number of kinds of features that have found a pose at the place that is answered.
     """
 
     chosen: Found
     outcome: Localization | Rejection
     doubts: Doubt
     place: PoseHypothesis | None = None
+    kinds: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +249,8 @@ def _at(place: _Place) -> Verdict:
     """The verdict for one place."""
     accepted = place.accepted
     chosen, counted = (accepted[0], accepted) if accepted else (place.poses[0], place.poses)
-    return Verdict(chosen, chosen.answer.outcome, reduce(and_, (it.doubts for it in counted)))
+    kinds = len({it.attempt.features for it in place.poses})
+    return Verdict(chosen, chosen.answer.outcome, reduce(and_, (it.doubts for it in counted)), kinds=kinds)
 
 
 def _rejected(found: Sequence[Found], within: Sequence[Hypothesis], priors: Priors, options: PlaceOptions) -> Verdict:

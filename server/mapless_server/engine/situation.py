@@ -1,0 +1,38 @@
+"""What is known of a photograph after an attempt, on which the rungs of the ladder depend."""
+
+from collections.abc import Sequence
+
+from mapless_server.method.judge.hypothesis import Doubt
+from mapless_server.method.ladder import Situation
+from mapless_server.method.options import Variant
+from mapless_server.method.promise import UNKNOWN, Known, PromiseOptions
+from mapless_server.method.rejection import Rejection
+
+from .query import Tier
+from .search import Search
+
+
+def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions) -> Situation:
+    """On which the rungs after the present attempt depend."""
+    query, material, verdict = search.query, search.material, search.verdict
+    can_be_elsewhere = material is not None and material.choice is not None and not query.is_part
+    place = None if verdict is None else verdict.place
+    return Situation(
+        is_best=query.options.variant is Variant.BEST,
+        reference_count=0 if material is None or search.coarse is None else len(material.references),
+        may_be_elsewhere=can_be_elsewhere and query.narrowing.has_likely,
+        has_place=place is not None and material is not None and len(place.references) < len(material.references),
+        can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),
+        any_roll=next((i for i, it in enumerate(tiers) if it.any_roll), None),
+        angles_deg=search.angles_deg,
+        known=_known(search),
+        promise=promise,
+    )
+
+
+def _known(search: Search) -> Known:
+    verdict = search.verdict
+    if verdict is None:
+        return UNKNOWN
+    is_accepted = not isinstance(verdict.outcome, Rejection)
+    return Known(search.agreement, is_accepted, Doubt.LOW_TRUST in verdict.doubts, verdict.kinds)

@@ -1,0 +1,111 @@
+"""Whether a further attempt is worth its processor time: what it can be expected to gain, from what is known already.
+
+A photograph of another place matches every reference by chance, whatever features are used, and an accepted pose that
+two kinds of features have found is right. So the expensive attempts are made where something is to be gained: the
+chance that they help, times the share of photographs that they help, for each second that they take.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from mapless_server.bounds import check_bounds
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What an attempt earns, and costs.
+
+    Attributes:
+        cost_s: processor time of a core, seconds; of `rematched`, with the first two references.
+        found: share of the photographs of the place without an accepted pose that it, or what follows it, answers.
+        corrected: share of the wrong answers that it, or what follows it, corrects.
+    """
+
+    cost_s: float
+    found: float
+    corrected: float
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "cost_s", above=0)
+        check_bounds(self, "found corrected", at_least=0, at_most=1)
+
+
+WORTH: Mapping[str, Worth] = {
+    "lines": Worth(0.4, 0.1, 0.0),
+    "lines at any roll": Worth(0.4, 0.003, 0.0),
+    "wide at any roll": Worth(0.15, 0.03, 0.1),
+    "turned": Worth(0.4, 0.1, 0.0),
+    "stronger": Worth(1.6, 0.15, 0.3),
+    "rematched": Worth(2.0, 0.12, 0.2),
+}
+"""By the name of the rung; those that are not listed are always worth it. Evidence: rungs-worth."""
+
+
+@dataclass(frozen=True)
+class PromiseOptions:
+    """When an attempt is worth its time.
+
+    Attributes:
+        agreement, spread: the chance that a photograph shows the place is a logistic function of the agreement of its
+            matches with a reference (see `features.rolls`); it is a half at the one, and rises over the other.
+        wrong_of_low_trust, wrong_otherwise: shares of the accepted poses that are wrong.
+        wrong_if_confirmed: share of these that remains for each further kind of features that finds the same place.
+        least_gain_per_s: photographs that a second of processor time must be expected to gain.
+    """
+
+    agreement: float = 2.7
+    spread: float = 0.15
+    wrong_of_low_trust: float = 0.29
+    wrong_otherwise: float = 0.01
+    wrong_if_confirmed: float = 0.1
+    least_gain_per_s: float = 0.01
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "agreement least_gain_per_s", at_least=0)
+        check_bounds(self, "spread", above=0)
+        check_bounds(self, "wrong_of_low_trust wrong_otherwise wrong_if_confirmed", at_least=0, at_most=1)
+
+
+PROMISE = PromiseOptions()
+"""Evidence: rungs-worth."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a photograph before a further attempt.
+
+    Attributes:
+        agreement: the largest that its matches with any reference have shown; infinite if it was not computed.
+        is_accepted: whether a pose is accepted.
+        is_of_low_trust: whether that is of low trust.
+        kinds: number of kinds of features that have found a pose at the place that is answered.
+    """
+
+    agreement: float = math.inf
+    is_accepted: bool = False
+    is_of_low_trust: bool = True
+    kinds: int = 1
+
+    def chance_of_place(self, options: PromiseOptions = PROMISE) -> float:
+        """The chance that the photograph shows the place."""
+        return 1 / (1 + math.exp(min(50.0, (options.agreement - self.agreement) / options.spread)))
+
+    def chance_wrong(self, options: PromiseOptions = PROMISE) -> float:
+        """The chance that the accepted pose is wrong."""
+        share = options.wrong_of_low_trust if self.is_of_low_trust else options.wrong_otherwise
+        return share * options.wrong_if_confirmed ** (self.kinds - 1)
+
+    def gain_per_s(self, worth: Worth, options: PromiseOptions = PROMISE) -> float:
+        """Photographs that an attempt is expected to gain for a second of processor time."""
+        gain = self.chance_wrong(options) * worth.corrected if self.is_accepted else worth.found
+        return gain / worth.cost_s * (1 if self.is_accepted else self.chance_of_place(options))
+
+    def is_worth(self, name: str, options: PromiseOptions = PROMISE) -> bool:
+        """Whether to make the attempt of a rung, see `WORTH`."""
+        worth = WORTH.get(name)
+        return worth is None or self.gain_per_s(worth, options) >= options.least_gain_per_s
+
+
+UNKNOWN = Known()
+"""Nothing is known: every attempt is worth it."""
