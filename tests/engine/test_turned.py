@@ -19,7 +19,8 @@ from support.images import encode, textured
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine import choosing
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import MIRROR, Caller, Photo, Query, QueryViews, Result, Tier
+from mapless_server.engine.photo_views import QueryViews
+from mapless_server.engine.query import MIRROR, Caller, Photo, Query, Result, Tier
 from mapless_server.engine.search import Search
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.extractors import SiftExtractor

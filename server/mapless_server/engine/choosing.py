@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from scipy.special import bdtrc
 
-from mapless_server.engine.query import QueryViews, RasterForm
+from mapless_server.engine.photo_views import QueryViews, RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
 from mapless_server.method.features.rolls import (

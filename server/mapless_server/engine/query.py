@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mapless_server import __version__
-from mapless_server.images import ImageLimits, decode_image, decode_mask
+from mapless_server.images import ImageLimits, decode_mask
 from mapless_server.method.bundle.priors import NO_PRIORS, Priors
-from mapless_server.method.features.extractors import Mirrors
-from mapless_server.method.features.extractors.turned import extract_turned
-from mapless_server.method.features.views import Photograph, reduce_image
-from mapless_server.method.options import StageContext, Variant
+from mapless_server.method.options import Variant
 from mapless_server.store import SceneAttributes, calibration_kind
 
 if TYPE_CHECKING:  # services need not load what computes
@@ -27,8 +23,7 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.judge.answer import Answer
     from mapless_server.method.options import LocalizeOptions
     from mapless_server.method.pipeline import Pipeline
-    from mapless_server.scenes import Choice, Narrowing, Selection, Vector
-    from mapless_server.scenes.library import Loaded
+    from mapless_server.scenes import Choice, Narrowing, Vector
     from mapless_server.scheduling import Flow
     from mapless_server.security import SceneKey
 
@@ -74,88 +69,6 @@ class Description:
     views: Mapping[str, View]
     descriptors: Mapping[str, Vector]
     ignored_share: float = 0.0
-
-
-@dataclass(frozen=True)
-class RasterForm:
-    """The raster in which features of a photograph are found.
-
-    Attributes:
-        angles_deg: the raster is turned clockwise by each of these; pixels of the features are of the photograph as it
-            is. Empty if it is not turned.
-        max_pixels: about so many at most; None for all.
-        is_mirrored: whether descriptors are those of the mirror image: such a view can be matched, but has no pose.
-    """
-
-    angles_deg: tuple[float, ...] = ()
-    max_pixels: int | None = None
-    is_mirrored: bool = False
-
-
-class _Decoded:
-    """A photograph that is decoded when it is first needed, and its views so far, by extractor and form."""
-
-    def __init__(self, photo: Photo, limits: ImageLimits) -> None:
-        self.views: dict[tuple[str, RasterForm], View] = {}
-        self._photo, self._limits = photo, limits
-        self._photograph: Photograph | None = None
-
-    def read(self, context: StageContext) -> Photograph:
-        """The photograph; InvalidArgument if it is bad."""
-        if self._photograph is None:
-            photo = self._photo
-            with context.stage("decode"):
-                pixels = decode_image(photo.image, self._limits, photo.field)
-                ignored = photo.read_ignored(self._limits)
-            identify = lambda: hashlib.sha256(photo.image).hexdigest()  # noqa: E731
-            self._photograph = Photograph(identify, photo.camera, lambda: pixels, lambda: ignored)
-        return self._photograph
-
-
-class QueryViews:
-    """Decodes a photograph once, and describes it once with each extractor in each form, when first needed.
-
-    Attributes:
-        form: the raster in which its features are found.
-    """
-
-    def __init__(self, photo: Photo, limits: ImageLimits) -> None:
-        self.form = RasterForm()
-        self._decoded = _Decoded(photo, limits)
-
-    def in_form(self, form: RasterForm) -> QueryViews:
-        """The same photograph, decoded once, whose features are found in another raster."""
-        views = object.__new__(QueryViews)
-        views.form, views._decoded = form, self._decoded
-        return views
-
-    def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
-        """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""
-        known, key = self._decoded.views, (extractor.name, self.form)
-        if key not in known and self.form.is_mirrored:
-            assert isinstance(extractor, Mirrors)
-            known[key] = extractor.mirrored(
-                self.in_form(replace(self.form, is_mirrored=False)).view(extractor, context)
-            )
-        if key not in known:
-            photograph = self._decoded.read(context)
-            with context.stage("features"):
-                known[key] = replace(_extracted(extractor, photograph, self.form), photograph=photograph)
-        return known[key]
-
-    def ignored_share(self, context: StageContext) -> float:
-        """Share of the pixels that its mask ignores, 0 to 1; InvalidArgument if image or mask is bad."""
-        return self._decoded.read(context).ignored_share
-
-
-def _extracted(extractor: FeatureExtractor, photograph: Photograph, form: RasterForm) -> View:
-    pixels, camera, ignored = photograph.read(), photograph.camera, photograph.read_ignored()
-    if form.max_pixels is not None:
-        share = min(1.0, math.sqrt(form.max_pixels / (camera.width_px * camera.height_px)))
-        pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
-    if form.angles_deg:
-        return extract_turned(extractor, pixels, camera, form.angles_deg, ignored)
-    return extractor.extract(pixels, camera, ignored)
 
 
 PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"
@@ -351,37 +264,3 @@ class Result:
     def is_tracked(self) -> bool:
         """Whether its references were chosen by a pose prior, see `tracking`."""
         return self.choice is not None and self.choice.descriptor == POSE_PRIOR
-
-
-class ReferenceSource(Protocol):
-    """Source of a query's references: `References`, or recorded or rendered ones."""
-
-    def load(
-        self,
-        scene_key: SceneKey,
-        reference_ids: Sequence[str],
-        extractor: FeatureExtractor,
-        context: StageContext,
-        waits: bool,
-    ) -> Loaded:
-        """Loads references of a scene, in the order given, with the scene's generation."""
-        ...
-
-    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Returns the attributes of a scene."""
-        ...
-
-    def choose(
-        self,
-        scene_key: SceneKey,
-        views: QueryViews,
-        selection: Selection,
-        context: StageContext,
-        extractor: FeatureExtractor | None = None,
-    ) -> Choice:
-        """Chooses references for a photograph, by what is made of this extractor's features if there is such."""
-        ...
-
-    def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """Reports that a chosen reference is not used because it is damaged."""
-        ...

@@ -6,7 +6,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from typing import TypeVar
 
-from mapless_server.engine.query import Description, Photo, QueryViews
+from mapless_server.engine.photo_views import QueryViews
+from mapless_server.engine.query import Description, Photo
 from mapless_server.errors import DeadlineExceeded, Overloaded, RequestError, Unavailable
 from mapless_server.method.options import StageContext
 from mapless_server.scenes import Choice, Coverage, Narrowing, ReferenceAudit, Selection, Viewpoint
@@ -33,9 +34,10 @@ from mapless_server.security import SceneKey
 
 from .failures import failure_of
 from .options import EngineOptions
-from .query import COARSE, PREPARE, REFINE, Caller, Query, ReferenceSource, Result, Tier
+from .query import COARSE, PREPARE, REFINE, Caller, Query, Result, Tier
 from .references import References
 from .search import Search, SearchJob
+from .source import ReferenceSource
 from .stages import Method, QueryStages
 
 ItemT = TypeVar("ItemT")

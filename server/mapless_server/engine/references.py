@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from mapless.names import reference_name
-from mapless_server.engine.query import Description, Photo, QueryViews
+from mapless_server.engine.photo_views import QueryViews
+from mapless_server.engine.query import Description, Photo
 from mapless_server.errors import DataLoss, InvalidArgument, NotFound
 from mapless_server.images import ImageLimits
 from mapless_server.method.features.extractors import FeatureExtractor

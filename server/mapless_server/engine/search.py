@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from mapless_server.engine.query import QueryViews
+from mapless_server.engine.photo_views import QueryViews
 from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.judge.hypothesis import Attempt, Where
 from mapless_server.method.ladder import Situation, first_attempt
@@ -18,7 +18,8 @@ from mapless_server.scenes import Choice
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
 from mapless_server.store import SceneAttributes
 
-from .query import PREPARE, REFINE, CutReason, LadderCut, Query, ReferenceSource, Result, Tried
+from .query import PREPARE, REFINE, CutReason, LadderCut, Query, Result, Tried
+from .source import ReferenceSource
 
 if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.judge.decide import Verdict

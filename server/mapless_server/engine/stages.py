@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from mapless_server.engine.query import RasterForm
+from mapless_server.engine.photo_views import RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method import ladder, pipeline

@@ -8,6 +8,7 @@ features/        features of photographs, their matches, tracks
 pairs/           matches of posed photographs; whether photographs agree with their poses, and why not if not
 structure/       metric points of the references, 2D-3D matches of the query
 bundle/          bundle adjustment of everything together; covariance; priors
+promise          whether a further attempt is worth its time
 options          the forms of the method that a request can choose; cancelling and timing of a computation
 pose/            pose estimators: from points, lines, depths, several cameras
 coarse/          query and references reconstructed together, up to scale; the metric scale

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mapless.names import reference_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.options import EngineOptions
+from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import (
     COARSE,
     POSE_PRIOR,
@@ -29,7 +30,6 @@ from mapless_server.engine.query import (
     REFINE,
     Caller,
     Query,
-    QueryViews,
     Result,
     Tier,
 )

@@ -1,0 +1,50 @@
+"""Where a query's references come from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from mapless_server.method.features.extractors import FeatureExtractor
+    from mapless_server.method.options import StageContext
+    from mapless_server.scenes import Choice, Selection
+    from mapless_server.scenes.library import Loaded
+    from mapless_server.security import SceneKey
+    from mapless_server.store import SceneAttributes
+
+    from .photo_views import QueryViews
+
+
+class ReferenceSource(Protocol):
+    """Source of a query's references: `References`, or recorded or rendered ones."""
+
+    def load(
+        self,
+        scene_key: SceneKey,
+        reference_ids: Sequence[str],
+        extractor: FeatureExtractor,
+        context: StageContext,
+        waits: bool,
+    ) -> Loaded:
+        """Loads references of a scene, in the order given, with the scene's generation."""
+        ...
+
+    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+        """Returns the attributes of a scene."""
+        ...
+
+    def choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        selection: Selection,
+        context: StageContext,
+        extractor: FeatureExtractor | None = None,
+    ) -> Choice:
+        """Chooses references for a photograph, by what is made of this extractor's features if there is such."""
+        ...
+
+    def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
+        """Reports that a chosen reference is not used because it is damaged."""
+        ...
