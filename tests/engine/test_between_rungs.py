@@ -40,8 +40,8 @@ def ended(result: Result) -> list[tuple[str, str, bool]]:
 
 def test_what_a_caller_leaves_between_rungs_is_freed(setting: Setting, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next rung is not computed; others, which hold both threads meanwhile, are answered."""
-    of_aside = Lane.stage_of_aside  # which might come before the others
-    monkeypatch.setattr(Lane, "stage_of_aside", lambda it, allowed: None if any(it.queues) else of_aside(it, allowed))
+    has_work = Lane.has_work  # threads of low priority would compute the rung at once
+    monkeypatch.setattr(Lane, "has_work", lambda it, is_low: not is_low and has_work(it, is_low))
     entered, gate, freed = threading.Semaphore(0), threading.Event(), threading.Event()
 
     def reply(view: View, references: Sequence[PosedView], _: object) -> Answer:

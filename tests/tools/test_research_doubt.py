@@ -27,7 +27,8 @@ def dots(pixels: np.ndarray, camera: Camera) -> np.ndarray:
     """An image (H, W, 1) with a smooth dot around each pixel."""
     columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     squared = [(columns - x) ** 2 + (rows - y) ** 2 for x, y in pixels]
-    return (255 * np.exp(-np.array(squared) / 8).sum(axis=0)).round().clip(0, 255).astype(np.uint8)[..., None]
+    brightness = (255 * np.exp(-np.array(squared) / 8).sum(axis=0)).round().clip(0, 255)
+    return np.asarray(brightness[..., None], np.uint8)
 
 
 @pytest.mark.parametrize("angle_deg", [0, 30, 45, 90, 135, 180, -70])

@@ -5,19 +5,20 @@ import json
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
 from mapless_tools.output_files import check_writable, markdown_table, write_json
 from research.contradictions.asking import Row
-from research.contradictions.places import place_reader
+from research.contradictions.places import PlaceOf, place_reader
 
 from .cases import (
     ANGLES_DEG,
     CROSSED_REFERENCES,
     EXPENSIVE_S,
     LIST,
+    Asked,
     candidates,
     doubtful,
     other_places,
@@ -72,7 +73,7 @@ def measure(arguments: argparse.Namespace) -> Sequence[Row]:
     if arguments.in_process:
         return ask(accepted(arguments.scenes, QUERIES // arguments.every), arguments.json)
     of = place_reader(arguments.scenes)
-    asked_of = {
+    asked_of: dict[str, Callable[[PlaceOf], Iterable[Asked]]] = {
         "other-place": partial(other_places, references=arguments.references),
         "doubtful": candidates if arguments.list else doubtful,
         "turned": turned_photographs,

@@ -45,7 +45,7 @@ def turned_camera(camera: Camera, angle_deg: float) -> Camera:
 def turned_image(photograph: Path, camera: Camera, angle_deg: float) -> bytes:
     """The turned photograph of a file, as PNG."""
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels = cv2.imdecode(np.frombuffer(photograph.read_bytes(), np.uint8), flags)
+    pixels = np.asarray(cv2.imdecode(np.frombuffer(photograph.read_bytes(), np.uint8), flags), np.uint8)
     return bytes(cv2.imencode(".png", turned_pixels(pixels, camera, angle_deg))[1].tobytes())
 
 
@@ -64,4 +64,4 @@ def _edge(camera: Camera) -> Array:
     size = np.array([camera.width_px, camera.height_px])
     along = np.linspace(0.0, 1.0, 65)
     sides = [np.stack(np.broadcast_arrays(*it), axis=-1) for end in (0.0, 1.0) for it in ((along, end), (end, along))]
-    return np.concatenate(sides) * size - 0.5
+    return np.asarray(np.concatenate(sides) * size - 0.5)
