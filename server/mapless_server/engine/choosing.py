@@ -84,7 +84,7 @@ def load_chosen(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loa
 def compared(search: Search) -> Search:
     """The search with what the matches of its attempt show: how much they agree, and how the photograph is rolled."""
     material = search.material
-    if material is None or not material.query_matches or any(it is material for it in search.materials[:-1]):
+    if material is None or not material.query_matches or any(it is material for it in search.materials):
         return search
     pairs = zip(material.references, material.query_matches, strict=True)
     found = [similarity_of(material.view, reference.view, matches) for reference, matches in pairs]

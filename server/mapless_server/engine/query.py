@@ -192,6 +192,7 @@ class Tried:
         outcome: "localized", the value of the rejection's reason, or how it ended without a verdict, such as "failed".
         seconds: its computing time.
         processor_s: its processor time.
+        agreement: the largest that matches of the attempts until then have shown, see `features.rolls`.
         is_chosen: whether the answer came from it.
     """
 
@@ -200,6 +201,7 @@ class Tried:
     outcome: str
     seconds: float
     processor_s: float
+    agreement: float = 0.0
     is_chosen: bool = False
 
 

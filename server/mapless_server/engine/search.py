@@ -176,7 +176,7 @@ class Search:
     def ended(self, outcome: str, features: str, has_result: bool = False) -> Search:
         """The search after the present attempt, which took the time since it began."""
         now = self.paused(self)
-        ended = Tried(self.rung, features, outcome, now.computed_s, now.processor_s)
+        ended = Tried(self.rung, features, outcome, now.computed_s, now.processor_s, self.agreement)
         before = self.attempt if has_result else self.before
         tried = (*self.tried, self.attempt)
         return replace(self, before=before, tried=tried, attempts=(*self.attempts, ended))

@@ -33,13 +33,13 @@ class Worth:
 
 WORTH: Mapping[str, Worth] = {
     "lines": Worth(0.4, 0.1, 0.0),
-    "lines at any roll": Worth(0.4, 0.003, 0.0),
+    "lines at any roll": Worth(0.4, 0.007, 0.0),
     "wide at any roll": Worth(0.15, 0.03, 0.1),
     "turned": Worth(0.4, 0.1, 0.0),
     "stronger": Worth(1.6, 0.15, 0.3),
     "rematched": Worth(2.0, 0.12, 0.2),
 }
-"""By the name of the rung; those that are not listed are always worth it. Evidence: rungs-worth."""
+"""By the name of the rung; those that are not listed are always worth it. Evidence: rungs-worth, rungs."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class PromiseOptions:
     wrong_of_low_trust: float = 0.29
     wrong_otherwise: float = 0.01
     wrong_if_confirmed: float = 0.1
-    least_gain_per_s: float = 0.01
+    least_gain_per_s: float = 0.02
 
     def __post_init__(self) -> None:
         check_bounds(self, "agreement least_gain_per_s", at_least=0)
@@ -68,7 +68,7 @@ class PromiseOptions:
 
 
 PROMISE = PromiseOptions()
-"""Evidence: rungs-worth."""
+"""Evidence: place-agreement."""
 
 
 @dataclass(frozen=True)

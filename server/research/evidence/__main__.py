@@ -22,6 +22,7 @@ MODULES = {
     "fairness": ("queue-credit", "queue-lately", "queue-client-share", "queue-failing", "queue-shorter"),
     "handshake": ("handshake",),
     "accused": ("accusation-chance",),
+    "worth": ("rungs-worth", "place-agreement"),
 }
 """The keys that each module measures, by `measure(key, scenes)`, which returns the question and its rows."""
 

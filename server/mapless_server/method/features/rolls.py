@@ -28,7 +28,7 @@ LEAST_ACROSS = 0.5
 """A direction shows the roll of a camera if so much of its unit vector is across the optical axis."""
 
 LEAST_AGREEMENT = 2.8
-"""Matches show a roll if they have at least this agreement. Evidence: rungs-worth."""
+"""Matches show a roll if they have at least this agreement. Evidence: place-agreement."""
 
 
 class Similarity(NamedTuple):
