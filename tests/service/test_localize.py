@@ -72,7 +72,7 @@ def test_an_answer_in_full(client: Client, scene: str) -> None:
     assert used.store_generation == client.get_scene(scene).generation
     assert used.scale is not None
     assert (used.scale.metres_per_unit, used.scale.stage) == (2.0, "TRIANGULATION")
-    assert list(used.stage_s) == ["decode", "features", "coarse", "pnp"]
+    assert list(used.stage_s) == ["decode", "features", "correspond", "coarse", "pnp"]
     assert used.stage_s["coarse"] == 0.1
     assert 0 <= used.queue_s <= used.total_s
     assert (used.processed_width_px, used.processed_height_px) == (96, 64)

@@ -173,6 +173,12 @@ class Search:
         rung, attempt = first_attempt(Situation(can_be_tracked=query.can_be_tracked))
         return cls(query, source, views, deadline_s, on_better, rung, attempt)
 
+    @property
+    def may_be_elsewhere(self) -> bool:
+        """Whether references elsewhere would be chosen without soft priors."""
+        can_be = self.material is not None and self.material.choice is not None and not self.query.is_part
+        return can_be and self.query.narrowing.has_likely
+
     def ended(self, outcome: str, features: str, has_result: bool = False) -> Search:
         """The search after the present attempt, which took the time since it began."""
         now = self.paused(self)

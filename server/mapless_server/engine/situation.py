@@ -15,12 +15,11 @@ from .search import Search
 def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions) -> Situation:
     """On which the rungs after the present attempt depend."""
     query, material, verdict = search.query, search.material, search.verdict
-    can_be_elsewhere = material is not None and material.choice is not None and not query.is_part
     place = None if verdict is None else verdict.place
     return Situation(
         is_best=query.options.variant is Variant.BEST,
         reference_count=0 if material is None or search.coarse is None else len(material.references),
-        may_be_elsewhere=can_be_elsewhere and query.narrowing.has_likely,
+        may_be_elsewhere=search.may_be_elsewhere,
         has_place=place is not None and material is not None and len(place.references) < len(material.references),
         can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),
         any_roll=next((i for i, it in enumerate(tiers) if it.any_roll), None),

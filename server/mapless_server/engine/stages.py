@@ -341,8 +341,7 @@ class QueryStages:
             raise ArithmeticError(f"the method's answer is not finite: {found.answer.outcome}, {found.answer.scale}")
         search.context.stage_seconds.update(found.answer.stage_seconds)
         found = self._verdicts.within_limits(search, found)
-        may_be_elsewhere = situation_of(search, self._tiers, self._doubt.promise).may_be_elsewhere
-        if may_be_elsewhere and choosing.resembles_elsewhere(search, found, self._verdicts.tier(search.attempt)):
+        if search.may_be_elsewhere and choosing.resembles_elsewhere(search, found, self._verdicts.tier(search.attempt)):
             found = replace(found, doubts=found.doubts | Doubt.LIKE_ELSEWHERE)
         search = choosing.compared(search) if found.doubts else search
         outcome, material = found.answer.outcome, search.material or search.materials[-1]
@@ -367,6 +366,8 @@ class QueryStages:
         if verdict is None:  # near the prior there was none
             first = search.to(ladder.AS_IT_IS, Attempt(), search.give_up_s, self._tiers[0].features)
             return self._next(first, first.first_step)
+        if not verdict.doubts:
+            return self._done(search)
         features = self._verdicts.tier(search.attempt).features
         before = search.before or search.attempt
         now_s = time.monotonic()

@@ -35,7 +35,7 @@ ALL = EngineOptions(doubt=DoubtOptions(promise=PromiseOptions(least_gain_per_s=0
 COUNTS = {"7scenes-redkitchen-seq01-first600": 3, "office-lockers": 12, "statue-of-liberty-internet": 20}
 FEW = 5
 """References of a folder: so few that photographs are in doubt."""
-OWN, OTHERS = 8, 4
+OWN, OTHERS = 6, 2
 """Photographs of a folder, and of others, that are asked in it."""
 SCENE = SceneKey("climbs")
 LIMIT_S = 600.0

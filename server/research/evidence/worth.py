@@ -1,6 +1,6 @@
 """What rungs are worth, and how the agreement of matches tells photographs of the place from others."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from research.doubt.climbing import Climb, climbs
 from .page import Question, Row
 
 DATA = (
-    "photographs of each folder of shared/data (8) and of other places (4), asked in it with 5 references (kitchen "
+    "photographs of each folder of shared/data (6) and of other places (2), asked in it with 5 references (kitchen "
     "3, lockers 12, statue 20) that are evenly spread; `auto` with EdgePoint2 L64, SIFT, ALIKED and LightGlue; the "
     "engine makes every attempt, worth it or not. Shares are (n + 1/2) / (all + 1), since few are tried. Processor "
     "time is that of the machine that measured it, beside other work: the code has that of a quiet one (see "
@@ -55,7 +55,7 @@ def measure(key: str, scenes: Path) -> tuple[Question, Iterator[Row]]:
 
 def shares(found: Sequence[Climb]) -> Iterator[Row]:
     """For each rung and kind of features, what it earns of photographs of the place without an accepted pose."""
-    tried, right, spent_s = Counter[str](), Counter[str](), Counter[str]()
+    tried, right, spent_s = Counter[str](), Counter[str](), defaultdict[str, float](float)
     for climb in (it for it in found if it.is_own):
         for attempt in climb.attempts:
             name = _name(attempt.rung, attempt.features)
