@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import cv2
@@ -23,6 +24,7 @@ from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import MIRROR, Caller, Photo, Query, Result, Tier
 from mapless_server.engine.search import Search
 from mapless_server.images import ImageLimits, decode_image
+from mapless_server.method.bundle.priors import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.views import Ignored, View, view_of
 from mapless_server.method.judge.answer import Localization
@@ -81,9 +83,14 @@ def localizing(folder: Path, tiers: Sequence[Tier], doubtful_trust: float = 0.25
         store.add_references(SCENE, references)
 
         def answer(
-            image: bytes, camera: Camera, named: tuple[str, ...] = (), narrowing: Narrowing = ANYWHERE
+            image: bytes,
+            camera: Camera,
+            named: tuple[str, ...] = (),
+            narrowing: Narrowing = ANYWHERE,
+            priors: Priors = NO_PRIORS,
         ) -> Result:
-            asked = Query(SCENE, named, Photo(image, camera, "image"), narrowing, 8, LocalizeOptions())
+            photo = Photo(image, camera, "image")
+            asked = Query(SCENE, named, photo, narrowing, 8, LocalizeOptions(), priors=priors)
             return loop.run_until_complete(engine.run(engine.query_job(asked, caller)))
 
         yield answer
@@ -160,15 +167,12 @@ def test_mirrored_is_what_matches_clearly_more(
     as_it_is: int, mirrored: int, is_mirrored: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Half as much again, and not by chance, as 45 of 65 matches may be."""
-
-    def planted(search: Search, views: QueryViews, tier: Tier) -> tuple[int, str]:
-        return (mirrored if views.form.is_mirrored else as_it_is), "r3"
-
-    monkeypatch.setattr(choosing, "_most_matches", planted)
+    monkeypatch.setattr(choosing, "_most_matches", lambda search, views, tier: (mirrored, "r3"))
     photo = Photo(photograph(TRUE), CAMERA, "image")
     query = Query(SCENE, NAMED, photo, ANYWHERE, 8, LocalizeOptions())
     search = Search.begin(query, cast(Any, None), QueryViews(photo, ImageLimits()), time.monotonic() + 60)
-    found = choosing.mirrored(search, Tier(SiftExtractor(), Pipeline()))
+    matched = cast(Any, SimpleNamespace(query_matches=(range(as_it_is), ())))
+    found = choosing.mirrored(replace(search, material=matched), Tier(SiftExtractor(), Pipeline()))
     assert (found is not None) == is_mirrored
     if found is not None:
         assert found.hint is not None
@@ -181,3 +185,18 @@ def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:
     result = localize(image, CAMERA, ())
     assert isinstance(result.answer.outcome, Rejection)
     assert any(stage.endswith(MIRROR) for stage in result.stage_seconds)
+
+
+@pytest.mark.parametrize("angle_deg", [90.0, 215.0])
+def test_a_gravity_prior_shows_how_to_turn_where_matches_do_not(tmp_path: Path, angle_deg: float) -> None:
+    image, camera, true = rolled(decode_image(photograph(TRUE), ImageLimits()), angle_deg)
+    down = np.array([0.0, 1.0, 0.0])
+    prior = GravityPrior(true.rotation.T @ down, down, 2.0)
+    with localizing(tmp_path, tiers()[:1]) as answer:
+        result = answer(encode(".png", image), camera, priors=Priors(gravity=prior))
+    outcome = result.answer.outcome
+    assert isinstance(outcome, Localization)
+    assert [it.rung for it in result.attempts if it.is_chosen] == ["turned"]
+    off_m, off_deg = pose_error(outcome.world_from_camera, true)
+    assert off_m < 0.03
+    assert off_deg < 0.5

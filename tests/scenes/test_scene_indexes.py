@@ -14,7 +14,7 @@ from support.stores import damage
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.options import StageContext
 from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes.library import FeaturesMissing, ReferenceLibrary
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, SceneChanges, Store
 
@@ -38,6 +38,29 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 def indexes_of(store: Store, capacity_bytes: int = 2**30) -> SceneIndexes:
     return SceneIndexes(store, ReferenceLibrary(store), DESCRIPTOR, EXTRACTOR, capacity_bytes)
+
+
+def test_who_does_not_wait_gets_those_described_in_the_background(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that fails is described when it is asked for again."""
+    store.add_references(SCENE, [new(i, is_described=False) for i in range(3)])
+    library = ReferenceLibrary(store)
+    indexes, add = SceneIndexes(store, library, DESCRIPTOR, EXTRACTOR, 2**30), store.add_descriptor
+    left = [1]
+
+    def add_descriptor(key: str, name: str, vector: Any) -> None:
+        if left and left.pop():
+            raise OSError("the database is locked")
+        add(key, name, vector)
+
+    monkeypatch.setattr(store, "add_descriptor", add_descriptor)
+    for _ in range(2):
+        with pytest.raises(FeaturesMissing):
+            indexes.entries(SCENE, StageContext(), waits=False)
+        library._background.submit(lambda: None).result(timeout=30)  # all before it has ended
+    assert len(indexes.entries(SCENE, StageContext(), waits=False)) == 3
+    library.close()
 
 
 class TestDamage:

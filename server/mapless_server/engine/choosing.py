@@ -51,15 +51,18 @@ MIRRORED_BY_CHANCE = 1e-6
 unevenly with less than this probability."""
 
 
-def described_anew(search: Search, tier: Tier) -> Material | None:
-    """The photograph and the references of the search's attempt; None if these are those of an attempt before."""
+def described_anew(search: Search, tier: Tier, any_roll: int | None) -> Material | None:
+    """The photograph and the references of the search's attempt; None if these are those of an attempt before.
+
+    `any_roll` is the index of the features that match however the camera is rolled.
+    """
     attempt, verdict, query = search.attempt, search.verdict, search.query
     if attempt.where is Where.ONE_PLACE and verdict is not None and verdict.place is not None:
         return search.materials[search.found.index(verdict.chosen)].of_place(verdict.place, attempt.basis)
     if attempt.where is Where.ANYWHERE and _is_same_anywhere(search, tier):
         return None
     views = search.views.in_form(RasterForm(attempt.angles_deg))
-    found = _chosen(search, views, tier) if query.chooses else _named(search, views, tier)
+    found = _chosen(search, views, tier, any_roll) if query.chooses else _named(search, views, tier)
     if found.query_matches is not None:
         return found
     with search.context.stage("correspond"):
@@ -136,7 +139,9 @@ def mirrored(search: Search, tier: Tier) -> Rejection | None:
     like the mirror image of others would give it a wrong pose. The best of its references counts: others may not show
     the same.
     """
-    as_it_is, _ = _most_matches(search, search.views, tier)
+    material = search.material
+    assert material is not None
+    as_it_is = max(map(len, material.query_matches or ()), default=0)
     most, name = _most_matches(search, search.views.in_form(RasterForm(is_mirrored=True)), tier)
     chance = bdtrc(most - 1, most + as_it_is, 0.5) if most else 1.0
     if most >= PLACES.clearly_more * as_it_is and chance < MIRRORED_BY_CHANCE:
@@ -195,10 +200,10 @@ def _named(search: Search, views: QueryViews, tier: Tier) -> Material:
     return Material(search.attempt.basis, views, views.view(tier.extractor, search.context), references, generation)
 
 
-def _chosen(search: Search, views: QueryViews, tier: Tier) -> Material:
+def _chosen(search: Search, views: QueryViews, tier: Tier, any_roll: int | None) -> Material:
     """Chooses, among the references that resemble the photograph most, those with the most matches."""
     query, context = search.query, search.context
-    choice = _rolled_choice(search) or _shortlisted(search, views, _narrowing_of(search), tier)
+    choice = _rolled_choice(search, any_roll) or _shortlisted(search, views, _narrowing_of(search), tier)
     generation, shortlist = load_chosen(search, [it.reference_id for it in choice.references], tier)
     view = views.view(tier.extractor, context)
 
@@ -213,12 +218,17 @@ def _chosen(search: Search, views: QueryViews, tier: Tier) -> Material:
     return Material(search.attempt.basis, views, view, chosen, generation, choice, query_matches)
 
 
-def _rolled_choice(search: Search) -> Choice | None:
+def _rolled_choice(search: Search, any_roll: int | None) -> Choice | None:
     """The references chosen by what matches at any roll, for the photograph turned as it was found to be rolled."""
-    if not search.attempt.angles_deg:
-        return None
-    chosen = [it.choice for it in search.materials if it.views.form == RasterForm() and it.choice is not None]
-    return chosen[-1] if chosen else None
+    attempt, by_others = search.attempt, zip(search.materials, search.found, strict=True)
+    chosen = [
+        material.choice
+        for material, found in by_others
+        if found.attempt.raster is Raster.AS_IS
+        and found.attempt.features == any_roll
+        and found.attempt.where is attempt.where
+    ]
+    return chosen[-1] if attempt.angles_deg and chosen else None
 
 
 def _shortlisted(search: Search, views: QueryViews, narrowing: Narrowing, tier: Tier) -> Choice:

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 from mapless_server.engine.photo_views import QueryViews
 from mapless_server.method.features.views import Matches, PosedView, View
-from mapless_server.method.judge.hypothesis import Attempt, Where
-from mapless_server.method.ladder import Situation, first_attempt
+from mapless_server.method.judge.hypothesis import Attempt, Where, first_attempt
 from mapless_server.method.options import StageContext
 from mapless_server.method.rejection import PoseHypothesis
 from mapless_server.scenes import Choice
@@ -170,7 +169,7 @@ class Search:
         on_better: Callable[[Result], object] | None = None,
     ) -> Search:
         """The search at its first attempt."""
-        rung, attempt = first_attempt(Situation(can_be_tracked=query.can_be_tracked))
+        rung, attempt = first_attempt(query.can_be_tracked)
         return cls(query, source, views, deadline_s, on_better, rung, attempt)
 
     @property

@@ -12,6 +12,11 @@ from .query import Tier
 from .search import Search
 
 
+def any_roll_of(tiers: Sequence[Tier]) -> int | None:
+    """Index of the tier whose features match at any roll; None if there is none."""
+    return next((i for i, it in enumerate(tiers) if it.any_roll), None)
+
+
 def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions) -> Situation:
     """On which the rungs after the present attempt depend."""
     query, material, verdict = search.query, search.material, search.verdict
@@ -22,7 +27,7 @@ def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions)
         may_be_elsewhere=search.may_be_elsewhere,
         has_place=place is not None and material is not None and len(place.references) < len(material.references),
         can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),
-        any_roll=next((i for i, it in enumerate(tiers) if it.any_roll), None),
+        any_roll=any_roll_of(tiers),
         angles_deg=search.angles_deg,
         known=_known(search),
         promise=promise,

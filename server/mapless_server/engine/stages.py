@@ -18,7 +18,17 @@ from mapless_server.method import ladder, pipeline
 from mapless_server.method.bundle.estimate import Support
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.decide import decide
-from mapless_server.method.judge.hypothesis import Attempt, Doubt, Found, Hypothesis, Raster, Solver, Where, found_by
+from mapless_server.method.judge.hypothesis import (
+    AS_IT_IS,
+    Attempt,
+    Doubt,
+    Found,
+    Hypothesis,
+    Raster,
+    Solver,
+    Where,
+    found_by,
+)
 from mapless_server.method.options import DoubtOptions, Variant
 from mapless_server.method.pipeline import Coarse, Prepared, tracked_support
 from mapless_server.method.rejection import Rejection, RejectionReason
@@ -40,7 +50,7 @@ from . import choosing, cutting, tracking
 from .failures import failure_of
 from .query import COARSE, PREPARE, REFINE, TRACK, CutReason, LadderCut, Result, Tier
 from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
-from .situation import situation_of
+from .situation import any_roll_of, situation_of
 from .verdicts import Verdicts, attributes_of
 
 log = logging.getLogger(__name__)
@@ -91,6 +101,7 @@ class QueryStages:
         self._tiers = tiers
         self._doubt = doubt
         self._verdicts = Verdicts(tiers, doubt)
+        self._any_roll = any_roll_of(tiers)
         self._method = method or Method()
         self._is_alone = is_alone
 
@@ -192,7 +203,7 @@ class QueryStages:
         """The photograph and references of the attempt; None if an earlier attempt had the same."""
         attempt, known = search.attempt, search.material
         is_known = known is not None and known.basis == attempt.basis
-        material = known if is_known else choosing.described_anew(search, self._verdicts.tier(attempt))
+        material = known if is_known else choosing.described_anew(search, self._verdicts.tier(attempt), self._any_roll)
         if material is None or not attempt.matching.is_strong:
             return material
         assert material.query_matches is not None
@@ -224,7 +235,9 @@ class QueryStages:
         """Matches the next reference, or goes on with the query if all are matched or no time is left for more."""
         material = search.material
         assert material is not None
-        matched = cutting.without_unmatched(search, self._verdicts.tier(search.attempt).features)
+        matched = search
+        if material.unmatched:
+            matched = cutting.without_unmatched(search, self._verdicts.tier(search.attempt).features)
         if self._has_time_to_rematch(search):
             # If the queue finds no time for that, the pose is computed from the matches there are.
             names = [f"{search.kind}, {it}" for it in ("rematch", "matched")]
@@ -364,7 +377,7 @@ class QueryStages:
     def _climb(self, search: Search) -> SearchResult:
         verdict = search.verdict
         if verdict is None:  # near the prior there was none
-            first = search.to(ladder.AS_IT_IS, Attempt(), search.give_up_s, self._tiers[0].features)
+            first = search.to(AS_IT_IS, Attempt(), search.give_up_s, self._tiers[0].features)
             return self._next(first, first.first_step)
         if not verdict.doubts:
             return self._done(search)

@@ -72,30 +72,38 @@ class Verdicts:
             return found
         return replace(found, answer=replace(found.answer, outcome=replace(outcome, imprecise=None)))
 
-    def answer(self, search: Search) -> Result:
-        """The result for the caller by the verdict."""
+    def answer(self, search: Search, compares: bool = True) -> Result:
+        """The result for the caller by the verdict; see `hints.hinted` for `compares`."""
         verdict = search.verdict
         assert verdict is not None
         chosen = verdict.chosen
         if search.query.is_part and chosen.answer.support is None:  # its group needs what matches there are
             chosen = next((it for it in reversed(search.found) if it.answer.support is not None), chosen)
-        result = self.result(search, chosen, search.materials[search.found.index(chosen)], verdict.outcome)
+        material = search.materials[search.found.index(chosen)]
+        result = self.result(search, chosen, material, verdict.outcome, compares)
         ended = zip(search.attempts, search.tried, strict=True)
         attempts = tuple(replace(it, is_chosen=tried == chosen.attempt) for it, tried in ended)
         answer = _with_unfinished(result.answer, attempts)
         return replace(result, answer=answer, attempts=attempts, cuts=search.cuts)
 
     def without_present(self, search: Search, outcome: str, reason: CutReason) -> Result:
-        """The result without the present attempt, which ended so."""
+        """The result without the present attempt, which ended so; quickly, since the queue may wait for it."""
         features = self.tier(search.attempt).features
-        return self.answer(search.ended(outcome, features).cut(search.rung, features, reason))
+        return self.answer(search.ended(outcome, features).cut(search.rung, features, reason), compares=False)
 
-    def result(self, search: Search, found: Found, material: Material, outcome: Localization | Rejection) -> Result:
+    def result(
+        self,
+        search: Search,
+        found: Found,
+        material: Material,
+        outcome: Localization | Rejection,
+        compares: bool = True,
+    ) -> Result:
         """The result of an attempt with an outcome, whose hint says what would help."""
         answer, contradiction = replace(found.answer, outcome=outcome), search.attributes.contradiction
         if isinstance(outcome, Rejection):
             has_prior = material.is_searched and not search.query.narrowing.is_empty
-            answer = hinted(answer, material.view, material.references, has_prior)
+            answer = hinted(answer, material.view, material.references, has_prior, compares)
             assert isinstance(answer.outcome, Rejection)
             answer = replace(answer, outcome=with_contradiction(answer.outcome, contradiction))
         return Result(

@@ -19,7 +19,6 @@ class Situation:
     Attributes:
         is_best: whether the variant of the method is the best one; the paper's has one attempt.
         reference_count: number of references that the attempt before was reconstructed with.
-        can_be_tracked: whether a pose prior says which references are near.
         may_be_elsewhere: whether references elsewhere would be chosen without soft priors.
         has_place: whether the priors exclude one of two places that explain the photograph.
         can_match_strongly: for each features, whether a network can match them.
@@ -31,7 +30,6 @@ class Situation:
 
     is_best: bool = True
     reference_count: int = 2
-    can_be_tracked: bool = False
     may_be_elsewhere: bool = False
     has_place: bool = False
     can_match_strongly: tuple[bool, ...] = (False,)
@@ -73,8 +71,6 @@ STRENGTHENED = (
     Doubt.STARVED | Doubt.CHANCE | Doubt.TWO_PLACES | Doubt.BEYOND_LIMITS | Doubt.LOW_TRUST | Doubt.WIDE_RADIUS
 )
 """Doubts that better matches can remove."""
-
-TRACKED, AS_IT_IS = "tracked", "as it is"
 
 
 def _with_features(features: int, before: Attempt, situation: Situation) -> Attempt:
@@ -198,13 +194,6 @@ RUNGS = (
 
 NAMES = tuple(it.name for it in RUNGS)
 """Their names, in this order. Evidence: rungs."""
-
-
-def first_attempt(situation: Situation) -> tuple[str, Attempt]:
-    """The rung's name and the attempt that begins."""
-    if situation.can_be_tracked:
-        return TRACKED, Attempt(raster=Raster.REDUCED, where=Where.NEAR_PRIOR)
-    return AS_IT_IS, Attempt()
 
 
 def further(

@@ -35,7 +35,6 @@ WORTH: Mapping[str, Worth] = {
     "lines": Worth(0.4, 0.1, 0.0),
     "lines at any roll": Worth(0.4, 0.007, 0.0),
     "wide at any roll": Worth(0.15, 0.03, 0.1),
-    "turned": Worth(0.4, 0.1, 0.0),
     "stronger": Worth(1.6, 0.15, 0.3),
     "rematched": Worth(2.0, 0.12, 0.2),
 }
@@ -108,4 +107,4 @@ class Known:
 
 
 UNKNOWN = Known()
-"""Nothing is known: every attempt is worth it."""
+"""Nothing is known, so that the photograph may as well show the place."""

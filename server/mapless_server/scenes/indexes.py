@@ -124,7 +124,13 @@ class SceneIndexes:
         for reference_id, key in undescribed:
             if key not in cached.scheduled:
                 cached.scheduled.add(key)
-                self._library.later(partial(self._describe, scene_key, cached, reference_id, key, StageContext()))
+                self._library.later(partial(self._describe_scheduled, scene_key, cached, reference_id, key))
+
+    def _describe_scheduled(self, scene_key: SceneKey, cached: _CachedIndex, reference_id: str, key: str) -> None:
+        try:
+            self._describe(scene_key, cached, reference_id, key, StageContext())
+        finally:  # if that failed for a reason that passes, the next query schedules it again
+            cached.scheduled.discard(key)
 
     def _describe(
         self, scene_key: SceneKey, cached: _CachedIndex, reference_id: str, key: str, context: StageContext

@@ -135,7 +135,16 @@ class ReferenceLibrary:
         if new:
             _log_describing(new, extractor)
         for record in new:
-            self.later(partial(self._describe_all, [record], extractor, lambda: None))
+            self.later(partial(self._describe_scheduled, record, extractor))
+
+    def _describe_scheduled(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
+        try:
+            self._describe_all([record], extractor, lambda: None)
+        except RequestError as error:
+            log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_key, error)
+        finally:  # if that failed for a reason that passes, the next query schedules it again
+            with self._scheduling:
+                self._scheduled.discard((record.key, extractor.name))
 
     def later(self, describe: Callable[[], None]) -> None:
         """Describes in the background, after what is to be described already."""

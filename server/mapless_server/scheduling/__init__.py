@@ -47,7 +47,7 @@ from .jobs import (
     StageResult,
     Step,
 )
-from .processor import count_helper, processor_s
+from .processor import count_helper, may_have_helpers, processor_s
 from .work_queue import Failure, Fatal, WorkQueue
 
 __all__ = [
@@ -83,5 +83,6 @@ __all__ = [
     "WorkQueueOptions",
     "compute_items",
     "count_helper",
+    "may_have_helpers",
     "processor_s",
 ]

@@ -12,9 +12,10 @@ of the process wants, and all of one that no other wants."""
 
 
 class _Helped(threading.local):
-    """Processor time that other threads have spent for this thread."""
+    """Processor time that other threads have spent for this thread, and whether it is of low priority."""
 
     seconds = 0.0
+    is_low = False
 
 
 _helped = _Helped()
@@ -30,11 +31,17 @@ def count_helper(seconds: float) -> None:
     _helped.seconds += seconds
 
 
+def may_have_helpers() -> bool:
+    """Whether other threads may compute for the calling one; for one of low priority they would have a higher one."""
+    return not _helped.is_low
+
+
 def lower_priority() -> None:
     """Lets the calling thread, and those that it starts, compute only when others leave a core free, where possible.
 
     Only Linux has a niceness of threads; elsewhere, or where it is not permitted, they share the cores equally.
     """
+    _helped.is_low = True
     if sys.platform == "linux":
         with suppress(OSError):
             own = threading.get_native_id()

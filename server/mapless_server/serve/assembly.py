@@ -156,13 +156,15 @@ def engine_over(
         kind = None if depth_network is None else depth_kind(depth_network.name, depth_network.weights_sha256)
         depths = DepthFinder(store.database, observed, kind)
     library = ReferenceLibrary(store, depths if any(tier.uses_depths for tier in tiers) else None)
-    indexes = SceneIndexes(store, library, descriptor, first, options.index_cache_bytes)
+    any_roll = [tier for tier in tiers[1:] if tier.any_roll]
+    capacity_bytes = options.index_cache_bytes // (1 + len(any_roll))
+    indexes = SceneIndexes(store, library, descriptor, first, capacity_bytes)
     retrievals = [Retrieval(descriptor, first, indexes)]
-    for tier in tiers[1:]:
-        if tier.any_roll:  # photographs that are rolled resemble references by these features alone
-            own, capacity_bytes = VladDescriptor.of(tier.extractor), options.index_cache_bytes
-            own_indexes = SceneIndexes(store, library, own, tier.extractor, capacity_bytes)
-            retrievals.append(Retrieval(own, tier.extractor, own_indexes))
+    for tier in any_roll:  # photographs that are rolled resemble references by these features alone
+        own = VladDescriptor.of(tier.extractor)
+        retrievals.append(
+            Retrieval(own, tier.extractor, SceneIndexes(store, library, own, tier.extractor, capacity_bytes))
+        )
     matcher = tiers[0].pipeline.matcher
     pairs = PairMatches(matcher.options.reference_ratio, CACHED_AUDIT_PAIRS, matcher.pairs.arithmetic)
     agreements = SceneAgreements(store, indexes, library, first, tiers[0].pipeline.matcher, observed)

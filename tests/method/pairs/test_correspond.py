@@ -1,6 +1,8 @@
 """Matching of descriptors: against brute force, against known epipolar geometry; the cache of pairs."""
 
+import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -27,6 +29,7 @@ from mapless_server.method.pairs import pair as reference_pairs
 from mapless_server.method.pairs.correspond import Matcher, make_matcher
 from mapless_server.method.pairs.epipolar import epipolar_distance_px, epipolar_distances_px
 from mapless_server.method.pairs.pair import Matching, in_order
+from mapless_server.scheduling.processor import lower_priority
 
 TWO = (Matching.STRICT, Matching.WIDE)
 
@@ -495,6 +498,19 @@ def test_every_extractor_has_its_options() -> None:
         assert make_matcher(name).options == OPTIONS[name]
     with pytest.raises(ValueError, match="unknown features 'surf'"):
         make_matcher("surf")
+
+
+def test_a_thread_of_low_priority_computes_alone() -> None:
+    shared, seen = SharedThreads(3), set[int]()
+
+    def compute() -> None:
+        lower_priority()
+        shared.map(lambda _: seen.add(threading.get_ident()), range(20))
+        assert seen == {threading.get_ident()}
+
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(compute).result(timeout=30)
+    shared.close()
 
 
 @pytest.mark.parametrize("threads", [1, 3])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapless_server.bounds import check_bounds
 from mapless_server.choices import EDGEPOINT2
-from mapless_server.scheduling import count_helper
+from mapless_server.scheduling import count_helper, may_have_helpers
 
 from .views import Features, Matches, PosedView, View
 
@@ -310,7 +310,8 @@ class SharedThreads:
             work()
             return time.thread_time() - begin_s
 
-        helpers = [self._pool.submit(help_out) for _ in range(min(self.threads, len(items)) - 1)]
+        helper_count = min(self.threads, len(items)) - 1 if may_have_helpers() else 0
+        helpers = [self._pool.submit(help_out) for _ in range(helper_count)]
         try:
             work()
         finally:

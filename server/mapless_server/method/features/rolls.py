@@ -18,11 +18,17 @@ from .views import Matches, View
 UPRIGHT_DEG = 20.0
 """Learned features still match what is rolled by so much: EdgePoint2 1353 of 2048 at 15 degrees, 377 at 30."""
 
+ROUNDED_DEG = 5.0
+"""Angles are rounded to this, so that slightly different matches lead to the same raster."""
+
 MAX_RASTERS = 3
 """A photograph is turned in so many ways at most, since each costs as much as the photograph as it is."""
 
 NEAR_SHARE = 0.05
 """Matches agree with a similarity of two images that are so near it, as a share of the width."""
+
+MAX_SCALE = 8.0
+"""Photographs that show something in sizes that differ more have no matches: wrong ones end in one patch of texture."""
 
 LEAST_ACROSS = 0.5
 """A direction shows the roll of a camera if so much of its unit vector is across the optical axis."""
@@ -65,7 +71,7 @@ def similarity_of(query: View, reference: View, matches: Matches) -> Similarity 
     found, inliers = cv2.estimateAffinePartial2D(
         ours[:, None], theirs[:, None], method=cv2.RANSAC, ransacReprojThreshold=near_px, maxIters=500
     )
-    if not inliers.any():
+    if not inliers.any() or not 1 / MAX_SCALE <= math.hypot(*found[:, 0]) <= MAX_SCALE:
         return None
     return Similarity(math.degrees(math.atan2(found[1, 0], found[0, 0])), int(inliers.sum()), len(matches))
 
@@ -95,14 +101,15 @@ def roll_about_axis(roll_deg: float) -> Array:
 def rasters_of(rolls_deg: Sequence[float], counts: Sequence[int]) -> tuple[float, ...]:
     """The angles, degrees clockwise in [0, 360), by which to turn a photograph with these rolls to references.
 
-    The references with the most matches come first; each is upright in a raster, if the largest number of rasters
-    suffices. Empty if all are upright in the photograph as it is.
+    The references with the most matches come first, whose angles the rasters have; the others are within twice
+    `UPRIGHT_DEG` of one, if the largest number of rasters suffices. Empty if the photograph as it is suffices.
     """
     chosen: list[float] = []
     for i in np.argsort(-np.asarray(counts), kind="stable"):
         roll_deg = float(rolls_deg[i])
         if all(apart_deg(roll_deg, it) > 2 * UPRIGHT_DEG for it in chosen):
-            chosen.append(0.0 if apart_deg(roll_deg, 0.0) <= UPRIGHT_DEG else float(round(roll_deg)) % 360)
+            rounded_deg = ROUNDED_DEG * round(roll_deg / ROUNDED_DEG) % 360
+            chosen.append(0.0 if apart_deg(roll_deg, 0.0) <= UPRIGHT_DEG else rounded_deg)
     chosen = chosen[:MAX_RASTERS]
     return () if chosen == [0.0] else tuple(chosen)
 

@@ -66,8 +66,19 @@ class _Case:
     has_prior: bool
 
 
-def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_prior: bool = False) -> Answer:
-    """Adds a hint to a rejection without one; `has_prior` is whether the request has one on position or heading."""
+def hinted(
+    answer: Answer, query: View, references: Sequence[PosedView], has_prior: bool = False, compares: bool = True
+) -> Answer:
+    """Adds a hint to a rejection without one.
+
+    Args:
+        answer: of the photograph, with the matches behind it.
+        query: the photograph.
+        references: its references, in order.
+        has_prior: whether the request has one on position or heading.
+        compares: whether other cameras are compared with the photograph's where few of its matches agree, which takes
+            up to a second.
+    """
     rejection = answer.outcome
     if not isinstance(rejection, Rejection) or rejection.hint is not None:
         return answer
@@ -85,7 +96,7 @@ def hinted(answer: Answer, query: View, references: Sequence[PosedView], has_pri
         len(references),
         has_prior,
     )
-    if rejection.reason in _OF_MATCHES and _agrees_little(case) and answer.support is not None:
+    if compares and rejection.reason in _OF_MATCHES and _agrees_little(case) and answer.support is not None:
         compared = compare_cameras(answer.support)
         if compared is not None and compared.is_significant:
             message = f"{compared.advice} All matches together fit a camera with {compared.named} better."

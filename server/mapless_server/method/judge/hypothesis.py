@@ -78,6 +78,17 @@ class Attempt:
         return replace(self, **changes)  # type: ignore[arg-type]
 
 
+TRACKED, AS_IT_IS = "tracked", "as it is"
+"""The rungs that begin."""
+
+
+def first_attempt(can_be_tracked: bool) -> tuple[str, Attempt]:
+    """The rung's name and the attempt that begins; near a pose prior, if there is one that says what is near."""
+    if can_be_tracked:
+        return TRACKED, Attempt(raster=Raster.REDUCED, where=Where.NEAR_PRIOR)
+    return AS_IT_IS, Attempt()
+
+
 class Doubt(Flag):
     """Why a further attempt could give a better answer, or why none can."""
 
