@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.names import reference_name
-from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, RequestError
+from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, RequestError, Unavailable
 from mapless_server.images import ImageLimits, decode_image, decode_mask
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
@@ -138,13 +138,15 @@ class ReferenceLibrary:
             self.later(partial(self._describe_scheduled, record, extractor))
 
     def _describe_scheduled(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
+        """Describes one reference; one that is damaged is not tried again, one that the store did not take now is."""
         try:
             self._describe_all([record], extractor, lambda: None)
-        except RequestError as error:
+        except Unavailable as error:
             log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_key, error)
-        finally:  # if that failed for a reason that passes, the next query schedules it again
             with self._scheduling:
                 self._scheduled.discard((record.key, extractor.name))
+        except Exception as error:  # it must not keep the others from being described
+            log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_key, error)
 
     def later(self, describe: Callable[[], None]) -> None:
         """Describes in the background, after what is to be described already."""
