@@ -17,6 +17,7 @@ from mapless_server.errors import DataLoss
 from mapless_server.method.features.rolls import (
     LEAST_AGREEMENT,
     Similarity,
+    are_alike,
     rasters_of,
     roll_about_axis,
     roll_of_directions,
@@ -114,7 +115,8 @@ def _rasters_by(search: Search, material: Material, found: Sequence[Similarity |
         world_from_query = references[best].world_from_camera.rotation @ roll_about_axis(roll.clockwise_deg)
         by_pose = (roll_of_rotation(it.world_from_camera.rotation.T @ world_from_query) for it in references)
         rolls = [it.clockwise_deg if it else other for it, other in zip(shown, by_pose, strict=True)]
-        return rasters_of(rolls, counts)
+        rasters = rasters_of(rolls, counts)
+        return search.angles_deg if are_alike(rasters, search.angles_deg) else rasters
     return search.angles_deg or rasters_of(*_rolls_by_priors(search, references))
 
 

@@ -14,6 +14,7 @@ from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.rolls import (
     LEAST_AGREEMENT,
     apart_deg,
+    are_alike,
     rasters_of,
     roll_about_axis,
     roll_of_directions,
@@ -82,6 +83,13 @@ def test_rasters_are_those_of_most_matches(
     rolls_deg: list[float], counts: list[int], expected: tuple[float, ...]
 ) -> None:
     assert rasters_of(rolls_deg, counts) == expected
+
+
+def test_rasters_turned_by_nearly_the_same_are_alike() -> None:
+    assert are_alike((355.0, 90.0), (3.0, 85.0))
+    assert not are_alike((355.0,), (15.0,))
+    assert not are_alike((90.0,), (90.0, 270.0))
+    assert are_alike((), ())
 
 
 @pytest.mark.parametrize("angles_deg", [[37.0], [200.0, 0.0]])

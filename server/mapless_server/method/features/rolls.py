@@ -114,6 +114,12 @@ def rasters_of(rolls_deg: Sequence[float], counts: Sequence[int]) -> tuple[float
     return () if chosen == [0.0] else tuple(chosen)
 
 
+def are_alike(first: Sequence[float], second: Sequence[float]) -> bool:
+    """Whether features of the one rasters, by their angles, match what those of the others match."""
+    pairs = zip(first, second, strict=False)
+    return len(first) == len(second) and all(apart_deg(a, b) <= UPRIGHT_DEG / 2 for a, b in pairs)
+
+
 def apart_deg(first_deg: float, second_deg: float) -> float:
     """The angle between two directions, 0 to 180 degrees."""
     return abs((first_deg - second_deg + 180) % 360 - 180)
