@@ -19,19 +19,21 @@ class Worth:
     Attributes:
         cost_s: processor time of a core, seconds; of `rematched`, with the first two references.
         found: share of the photographs of the place without an accepted pose that it, or what follows it, answers.
-        corrected: share of the wrong answers that it, or what follows it, corrects.
+        corrected: share of the wrong answers that it, or what follows it, corrects; None if it also makes right answers
+            more accurate, so that it is always made where a pose is accepted.
     """
 
     cost_s: float
     found: float
-    corrected: float
+    corrected: float | None
 
     def __post_init__(self) -> None:
         check_bounds(self, "cost_s", above=0)
-        check_bounds(self, "found corrected", at_least=0, at_most=1)
+        check_bounds(self, "found" if self.corrected is None else "found corrected", at_least=0, at_most=1)
 
 
 WORTH: Mapping[str, Worth] = {
+    "wide": Worth(0.15, 0.05, None),
     "lines": Worth(0.4, 0.1, 0.0),
     "lines at any roll": Worth(0.4, 0.007, 0.0),
     "wide at any roll": Worth(0.15, 0.03, 0.1),
@@ -53,7 +55,7 @@ class PromiseOptions:
         least_gain_per_s: photographs that a second of processor time must be expected to gain.
     """
 
-    agreement: float = 2.7
+    agreement: float = 3.0
     spread: float = 0.15
     wrong_of_low_trust: float = 0.29
     wrong_otherwise: float = 0.01
@@ -97,8 +99,9 @@ class Known:
 
     def gain_per_s(self, worth: Worth, options: PromiseOptions = PROMISE) -> float:
         """Photographs that an attempt is expected to gain for a second of processor time."""
-        gain = self.chance_wrong(options) * worth.corrected if self.is_accepted else worth.found
-        return gain / worth.cost_s * (1 if self.is_accepted else self.chance_of_place(options))
+        if not self.is_accepted:
+            return self.chance_of_place(options) * worth.found / worth.cost_s
+        return math.inf if worth.corrected is None else self.chance_wrong(options) * worth.corrected / worth.cost_s
 
     def is_worth(self, name: str, options: PromiseOptions = PROMISE) -> bool:
         """Whether to make the attempt of a rung, see `WORTH`."""

@@ -25,11 +25,11 @@ QUESTIONS = {
         "Which share of the photographs of the place that have no accepted pose does a rung answer, at what cost?",
         DATA,
         "An attempt is made if its share, times the chance that the photograph shows the place, is at least 0.02 "
-        "for each second. `lines` and `stronger` have the shares of rungs.md, too, which rest on more photographs; "
-        "`rematched` has its time with two references. An accepted pose is checked by stronger features only if it "
-        "is of low trust and no other features found one there: of 29 such poses in a hundred that are wrong "
-        "(2,528 photographs, see `DoubtOptions`) they are assumed to correct a third; of the accepted poses here "
-        "none was wrong, and none was changed.",
+        "for each second. `stronger` has the share of rungs.md, which rests on more photographs, and includes "
+        "what follows it; `rematched` has its time with two references. An accepted pose is checked by stronger "
+        "features only if it is of low trust and no other features found one there: of 29 such poses in a hundred "
+        "that are wrong (2,528 photographs, see `DoubtOptions`) stronger features are assumed to correct a third, "
+        "which is not measured.",
     ),
     "place-agreement": Question(
         "place-agreement",
@@ -37,10 +37,10 @@ QUESTIONS = {
         "How large is the agreement of matches (see `features.rolls.Similarity`) of photographs of the place and "
         "of others, after the photograph as it is and SIFT, where the first attempt left a doubt?",
         DATA,
-        "Between the two: photographs of other places reach 2.4, those of the place that any rung answers have at "
-        "least 2.8, most over 5. A photograph below costs what it costs at least, so the chance falls fast, over "
-        "0.15. `rolls.LEAST_AGREEMENT` is a little larger, since a roll by chance costs a search in a turned "
-        "raster.",
+        "Above all of other places but one: with 3.0 these get no network, and those of the place do; all that "
+        "any rung answers have over 4. A photograph below costs what it costs at least, so the chance falls fast, "
+        "over 0.15. `rolls.LEAST_AGREEMENT` is a little smaller, since photographs that are rolled by 45 degrees "
+        "reach 3.1 with the photograph itself.",
     ),
 }
 THRESHOLDS = (1.5, 2.0, 2.4, 2.7, 3.0, 4.0, 6.0)
