@@ -90,7 +90,7 @@ class SharedCores:
                     self._weights[taken] = LOW_WEIGHT if is_low else 1.0
 
     def _speeds(self) -> dict[Batch, float]:
-        """Of each thread: its share of the cores by its weight, and at most one core."""
+        """Each thread's share of the cores by its weight, and at most one core."""
         speeds, cores, waiting = dict[Batch, float](), float(CORES), dict(self._weights)
         while waiting:
             per_weight = cores / sum(waiting.values())

@@ -224,7 +224,7 @@ def test_a_further_step_of_an_earlier_stage_has_its_turn() -> None:
 
 @pytest.mark.parametrize("has_begun", [True, False])
 def test_an_attempt_that_has_begun_goes_on_though_jobs_are_refused(has_begun: bool) -> None:
-    """What was computed of it would be lost otherwise."""
+    """Its computed part would be lost otherwise."""
     toy = Toy()
     job = toy.admit(stage="refine", client="mine", deadline_s=200.0)
     batch = toy.take("host")

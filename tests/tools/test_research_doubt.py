@@ -1,4 +1,4 @@
-"""What `research.doubt` asks and sums up: turned rasters, crossed places, the list, and its tables."""
+"""Questions and sums of `research.doubt`: turned rasters, crossed places, the list, and its tables."""
 
 from pathlib import Path
 from typing import Any

@@ -24,7 +24,7 @@ from .query import POSE_PRIOR
 
 @dataclass(frozen=True, eq=False)
 class Retrieval:
-    """What chooses references: a descriptor made of a photograph's features or pixels, and the scenes' indexes of it.
+    """Chooses references: a descriptor made of a photograph's features or pixels, and the scenes' indexes of it.
 
     Photographs are described with the extractor before.
     """

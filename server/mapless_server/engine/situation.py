@@ -1,4 +1,4 @@
-"""What is known of a photograph after an attempt, on which the rungs of the ladder depend."""
+"""Properties of a photograph after an attempt, on which the rungs of the ladder depend."""
 
 from collections.abc import Sequence
 

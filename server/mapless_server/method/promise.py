@@ -14,7 +14,7 @@ from mapless_server.bounds import check_bounds
 
 @dataclass(frozen=True)
 class Worth:
-    """What an attempt earns, and costs.
+    """Gain and cost of an attempt.
 
     Attributes:
         cost_s: processor time of a core, seconds; of `rematched`, with the first two references.
@@ -74,7 +74,7 @@ PROMISE = PromiseOptions()
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of a photograph before a further attempt.
+    """Evidence about a photograph before a further attempt.
 
     Attributes:
         agreement: the largest that its matches with any reference have shown; infinite if it was not computed.

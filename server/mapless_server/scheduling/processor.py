@@ -7,8 +7,10 @@ import time
 from contextlib import suppress
 
 NICENESS = 10
-"""Of threads of low priority, above the process's own. Linux gives such a thread a tenth of a core that another thread
-of the process wants, and all of one that no other wants."""
+"""Niceness of threads of low priority, above the process's own.
+
+Linux gives such a thread a tenth of a core that another one of the process wants, and all of one that no other wants.
+"""
 
 
 class _Helped(threading.local):

@@ -29,7 +29,7 @@ from .sender import Metadata, connected, send_closed_loop
 from .step import Step
 
 MAX_OVER_ALONE = 1.5
-"""Of the fleet's median beside the neighbour, and of its 99th percentile beside lost robots."""
+"""Limits of the fleet's median beside a neighbour, and of its 99th percentile beside lost robots."""
 MIN_SHARE_OF_ANSWERS = 0.9
 _WARM_UP_S = 3.0
 """The neighbour calls before the fleet does, so that its calls have filled the queue."""

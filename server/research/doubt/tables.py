@@ -1,4 +1,4 @@
-"""What files of answers say, as Markdown."""
+"""Tables of files of answers, as Markdown."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -29,7 +29,7 @@ def _cells(rows: Sequence[Row]) -> list[object]:
 
 
 def by_angle(rows: Sequence[Row]) -> list[str]:
-    """Of the photographs that are right as they are, the outcomes at each angle, and the cost by that at 0 degrees."""
+    """Outcomes at each angle, of photographs that are right at 0 degrees, and the cost by that there."""
     upright = {_photograph(row): row for row in rows if row["angle_deg"] == 0 and row["outcome"] == "right"}
     body = []
     for angle_deg in sorted({row["angle_deg"] for row in rows}):

@@ -1,4 +1,4 @@
-"""What rungs are worth, and how the agreement of matches tells photographs of the place from others."""
+"""The worth of rungs, and the agreement of matches of the place and of other places."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence

@@ -319,7 +319,7 @@ def rejection_of(
     given_lens: Distortion | None = None,
     count: int | None = None,
 ) -> tuple[Rejection | None, Camera]:
-    """Of `support_of`, and the true camera."""
+    """The judgement of what `support_of` makes, and the true camera."""
     support, true = support_of(
         focal, principal, focal_x, outliers, sigma, doubted, is_estimated, lens, given_lens, count
     )
@@ -459,7 +459,7 @@ def test_intrinsics_estimated_with_the_pose_are_its_own(is_estimated: bool, is_n
 
 @pytest.mark.parametrize(("count", "is_accused"), [(22, False), (30, False), (300, True)])
 def test_few_matches_accuse_no_camera(count: int, is_accused: bool) -> None:
-    """Of twice the true focal length: the pose of one that fits far more of 22 matches is rejected, its camera not."""
+    """Twice the true focal length: the pose of one that fits far more of 22 matches is rejected, its camera not."""
     rejection, _ = rejection_of(focal=2.0, count=count)
     assert rejection
     assert bool(rejection.intrinsics_checks) is is_accused

@@ -206,7 +206,7 @@ class TestDecide:
 
 
 def imprecise(x_m: float = 0.0, inliers: int = 100) -> Answer:
-    """Of a pose that its radius alone speaks against."""
+    """The answer with a pose that its radius alone speaks against."""
     given = PoseHypothesis(pose(x_m), inliers, ("near",), np.eye(6))
     return posed(rejected(RejectionReason.GATE, imprecise=given), x_m, inliers)
 

@@ -38,7 +38,7 @@ LEAST_AGREEMENT = 2.8
 
 
 class Similarity(NamedTuple):
-    """What matches of a photograph and a reference have in common: a turn, a scale and a shift of their images.
+    """The turn, scale and shift of the images on which most matches of a photograph and a reference agree.
 
     Attributes:
         clockwise_deg: the roll of the photograph against the reference.
