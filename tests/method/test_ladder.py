@@ -83,7 +83,7 @@ def test_upright_features_are_found_turned_as_the_roll_is_known(before: Attempt)
     tried = [before, Attempt(raster=Raster.TURNED, angles_deg=(30.0, 210.0))]
     changed = {rung.name: it for rung, it in further(before, [before], Doubt.STARVED, situation)}
     assert changed["turned"] == tried[1]
-    assert changed["stronger"] == replace(tried[1], features=2)
+    assert changed["stronger"] == replace(tried[1], features=2, angles_deg=(30.0,))
     assert before.features == 1 or changed["any roll"] == Attempt(1)
 
 

@@ -62,7 +62,7 @@ def described_anew(search: Search, tier: Tier, any_roll: int | None) -> Material
         return search.materials[search.found.index(verdict.chosen)].of_place(verdict.place, attempt.basis)
     if attempt.where is Where.ANYWHERE and _is_same_anywhere(search, tier):
         return None
-    views = search.views.in_form(RasterForm(attempt.angles_deg))
+    views = search.views.in_form(RasterForm(attempt.angles_deg, tier.max_pixels))
     found = _chosen(search, views, tier, any_roll) if query.chooses else _named(search, views, tier)
     if found.query_matches is not None:
         return found
@@ -92,10 +92,15 @@ def compared(search: Search) -> Search:
         return search
     pairs = zip(material.references, material.query_matches, strict=True)
     found = [similarity_of(material.view, reference.view, matches) for reference, matches in pairs]
-    agreement = max((it.agreement for it in found if it is not None), default=0.0)
-    search = replace(search, agreement=max(search.agreement, agreement))
+    search = replace(search, agreement=max(search.agreement, _agreement_of(found, material.references)))
     is_upright = search.attempt.raster is Raster.AS_IS
     return replace(search, angles_deg=_rasters_by(search, material, found)) if is_upright else search
+
+
+def _agreement_of(found: Sequence[Similarity | None], references: Sequence[PosedView]) -> float:
+    """The agreement that as many references reach as a pose needs: two, or one that has depths."""
+    needed = 1 if any(it.depths is not None for it in references) else min(2, len(found))
+    return sorted((it.agreement if it else 0.0 for it in found), reverse=True)[needed - 1]
 
 
 def _rasters_by(search: Search, material: Material, found: Sequence[Similarity | None]) -> tuple[float, ...]:
@@ -117,10 +122,10 @@ def _rasters_by(search: Search, material: Material, found: Sequence[Similarity |
         rolls = [it.clockwise_deg if it else other for it, other in zip(shown, by_pose, strict=True)]
         rasters = rasters_of(rolls, counts)
         return search.angles_deg if are_alike(rasters, search.angles_deg) else rasters
-    return search.angles_deg or rasters_of(*_rolls_by_priors(search, references))
+    return search.angles_deg or rasters_of(_rolls_by_priors(search, references))
 
 
-def _rolls_by_priors(search: Search, references: Sequence[PosedView]) -> tuple[list[float], list[int]]:
+def _rolls_by_priors(search: Search, references: Sequence[PosedView]) -> list[float | None]:
     """The rolls that a prior on pose or gravity shows, of those references where it does."""
     pose, gravity = search.query.priors.pose, search.query.priors.gravity
     rolls: list[float | None] = []
@@ -130,8 +135,7 @@ def _rolls_by_priors(search: Search, references: Sequence[PosedView]) -> tuple[l
             rolls.append(roll_of_rotation(reference_from_world @ pose.world_from_camera.rotation))
         elif gravity is not None:
             rolls.append(roll_of_directions(gravity.in_camera, reference_from_world @ gravity.in_world))
-    known = [it for it in rolls if it is not None]
-    return known, [0] * len(known)
+    return rolls
 
 
 def mirrored(search: Search, tier: Tier) -> Rejection | None:
@@ -144,7 +148,7 @@ def mirrored(search: Search, tier: Tier) -> Rejection | None:
     material = search.material
     assert material is not None
     as_it_is = max(map(len, material.query_matches or ()), default=0)
-    most, name = _most_matches(search, search.views.in_form(RasterForm(is_mirrored=True)), tier)
+    most, name = _most_matches(search, search.views.in_form(RasterForm((), tier.max_pixels, is_mirrored=True)), tier)
     chance = bdtrc(most - 1, most + as_it_is, 0.5) if most else 1.0
     if most >= PLACES.clearly_more * as_it_is and chance < MIRRORED_BY_CHANCE:
         return _mirrored(most, as_it_is, name)

@@ -96,13 +96,15 @@ class Tier:
 
     The pipeline's matcher caches matches of these features, so no other tier may have the same one; tiers may share a
     reconstructor. References of a tier that `uses_depths` are loaded with the depths stored with them. Features that
-    match at `any_roll` of the camera, whose extractor `Mirrors`, may follow upright ones.
+    match at `any_roll` of the camera, whose extractor `Mirrors`, may follow upright ones. The features of a photograph
+    are found in a raster of `max_pixels` at most, those of references in theirs; None for all.
     """
 
     extractor: FeatureExtractor
     pipeline: Pipeline
     uses_depths: bool = False
     any_roll: bool = False
+    max_pixels: int | None = None
 
     @property
     def features(self) -> str:
@@ -192,7 +194,7 @@ class Tried:
         outcome: "localized", the value of the rejection's reason, or how it ended without a verdict, such as "failed".
         seconds: its computing time.
         processor_s: its processor time.
-        agreement: the largest that matches of the attempts until then have shown, see `features.rolls`.
+        agreement: the largest that matches with two references have shown until then, see `features.rolls`.
         is_chosen: whether the answer came from it.
     """
 

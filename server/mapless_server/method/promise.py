@@ -49,7 +49,7 @@ class PromiseOptions:
 
     Attributes:
         agreement, spread: the chance that a photograph shows the place is a logistic function of the agreement of its
-            matches with a reference (see `features.rolls`); it is a half at the one, and rises over the other.
+            matches with two references (see `features.rolls`); it is a half at the one, and rises over the other.
         wrong_of_low_trust, wrong_otherwise: shares of the accepted poses that are wrong.
         wrong_if_confirmed: share of these that remains for each further kind of features that finds the same place.
         least_gain_per_s: photographs that a second of processor time must be expected to gain.
@@ -77,7 +77,7 @@ class Known:
     """Evidence about a photograph before a further attempt.
 
     Attributes:
-        agreement: the largest that its matches with any reference have shown; infinite if it was not computed.
+        agreement: the largest that its matches with two references have shown; infinite if it was not computed.
         is_accepted: whether a pose is accepted.
         is_of_low_trust: whether that is of low trust.
         kinds: number of kinds of features that have found a pose at the place that is answered.

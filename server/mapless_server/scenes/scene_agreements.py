@@ -110,7 +110,7 @@ class SceneAgreements:
         matcher: Matcher,
         observer: BackgroundObserver,
     ) -> None:
-        """The extractor and the matcher are those of the first tier's queries."""
+        """The extractor and the matcher compare references: those of one of the tiers."""
         self._pairs = PairStore(store.database)
         self._indexes, self._matcher = indexes, matcher
         self._explainer = SceneExplainer(indexes, library, extractor, matcher, self._check)

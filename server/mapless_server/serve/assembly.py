@@ -167,7 +167,9 @@ def engine_over(
         )
     matcher = tiers[0].pipeline.matcher
     pairs = PairMatches(matcher.options.reference_ratio, CACHED_AUDIT_PAIRS, matcher.pairs.arithmetic)
-    agreements = SceneAgreements(store, indexes, library, first, tiers[0].pipeline.matcher, observed)
+    # References that are rolled against one another agree only by what matches at any roll.
+    comparing = any_roll[0] if any_roll else tiers[0]
+    agreements = SceneAgreements(store, indexes, library, comparing.extractor, comparing.pipeline.matcher, observed)
     tools = SceneTools(library, indexes, descriptor, first, pairs)
     references = References(tools, retrievals, extractors, options.image_limits, agreements)
     engine = QueueEngine(tiers, references, options, observer, quota, method)

@@ -35,14 +35,14 @@ def seen(pixels: NDArray[np.float64]) -> View:
 @pytest.mark.parametrize("angle_deg", [0.0, 33.0, -120.0, 179.0])
 def test_matches_show_the_roll_despite_wrong_ones(angle_deg: float) -> None:
     random = random_for("roll", angle_deg)
-    ours = random.uniform((0, 0), (CAMERA.width_px, CAMERA.height_px), (40, 2))
+    ours = random.uniform((0, 0), (CAMERA.width_px, CAMERA.height_px), (100, 2))
     theirs = 0.7 * ours @ roll_about_axis(angle_deg)[:2, :2].T + 50.0
-    theirs[:20] = random.uniform((0, 0), (CAMERA.width_px, CAMERA.height_px), (20, 2))
-    roll = similarity_of(seen(ours), seen(theirs), np.repeat(np.arange(40, dtype=np.int32)[:, None], 2, axis=1))
+    theirs[:50] = random.uniform((0, 0), (CAMERA.width_px, CAMERA.height_px), (50, 2))
+    roll = similarity_of(seen(ours), seen(theirs), np.repeat(np.arange(100, dtype=np.int32)[:, None], 2, axis=1))
     assert roll is not None
     assert roll.agreement > LEAST_AGREEMENT
     assert apart_deg(roll.clockwise_deg, angle_deg) < 3
-    assert roll.agreeing >= 20
+    assert roll.agreeing >= 50
 
 
 def test_matches_by_chance_show_no_roll() -> None:

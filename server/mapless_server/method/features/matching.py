@@ -173,6 +173,7 @@ class CorrespondOptions:
             all.
         rematched_references: so many references of a query, those with the most matches, are matched again by a
             `PairMatching`, if there is one.
+        rematched_keypoints: so many keypoints of each photograph, the strongest, are matched again.
         promising_references, promising_matches: if it finds fewer matches with each of so many, the others are not
             matched.
         enough_matches: pairs of references for which nearest neighbours find so many are not matched by it.
@@ -190,6 +191,7 @@ class CorrespondOptions:
     sampled_share: int = 6
     enough_sampled: float = 30.0
     rematched_references: int = 5
+    rematched_keypoints: int = 512
     promising_references: int = 2
     promising_matches: int = 20
     enough_matches: int = 500
@@ -200,7 +202,7 @@ class CorrespondOptions:
         check_bounds(self, "reference_ratio query_ratio distinct_ratio wide_ratio", above=0, at_most=1)
         check_bounds(self, "wide_similarity guided_similarity", at_least=-1)
         check_bounds(self, "epipolar_px", above=0)
-        check_bounds(self, "sampled_share promising_references", at_least=1)
+        check_bounds(self, "sampled_share rematched_keypoints promising_references", at_least=1)
         check_bounds(self, "enough_sampled", at_least=0)
         check_bounds(self, "promising_matches", at_least=0)
         check_bounds(self, "rematched_references enough_matches remembered_pairs structure_bytes", at_least=0)

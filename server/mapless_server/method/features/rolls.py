@@ -33,8 +33,11 @@ MAX_SCALE = 8.0
 LEAST_ACROSS = 0.5
 """A direction shows the roll of a camera if so much of its unit vector is across the optical axis."""
 
-LEAST_AGREEMENT = 2.8
+LEAST_AGREEMENT = 4.5
 """Matches show a roll if they have at least this agreement. Evidence: place-agreement."""
+
+LARGEST_SWING_DEG = 60.0
+"""Cameras whose optical axes are further apart hardly show the same, and their roll means less the further they are."""
 
 
 class Similarity(NamedTuple):
@@ -76,12 +79,15 @@ def similarity_of(query: View, reference: View, matches: Matches) -> Similarity 
     return Similarity(math.degrees(math.atan2(found[1, 0], found[0, 0])), int(inliers.sum()), len(matches))
 
 
-def roll_of_rotation(reference_from_query: Array) -> float:
+def roll_of_rotation(reference_from_query: Array) -> float | None:
     """The roll, degrees clockwise, of a camera by its rotation (3, 3) in another's frame: that about the optical axis.
 
-    Swing-twist decomposition: the twist about z is what is left when the optical axis is turned the shortest way.
+    Swing-twist decomposition: the twist about z is what is left when the optical axis is turned the shortest way. None
+    if that turns it by more than `LARGEST_SWING_DEG`.
     """
     r = reference_from_query
+    if r[2, 2] < math.cos(math.radians(LARGEST_SWING_DEG)):
+        return None
     return math.degrees(math.atan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1]))
 
 
@@ -98,15 +104,15 @@ def roll_about_axis(roll_deg: float) -> Array:
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
-def rasters_of(rolls_deg: Sequence[float], counts: Sequence[int]) -> tuple[float, ...]:
+def rasters_of(rolls_deg: Sequence[float | None], counts: Sequence[int] | None = None) -> tuple[float, ...]:
     """The angles, degrees clockwise in [0, 360), by which to turn a photograph with these rolls to references.
 
-    The references with the most matches come first, whose angles the rasters have; the others are within twice
+    Those whose roll is None are left out. The references with the most matches come first, whose angles the rasters have; the others are within twice
     `UPRIGHT_DEG` of one, if the largest number of rasters suffices. Empty if the photograph as it is suffices.
     """
     chosen: list[float] = []
-    for i in np.argsort(-np.asarray(counts), kind="stable"):
-        roll_deg = float(rolls_deg[i])
+    order = range(len(rolls_deg)) if counts is None else np.argsort(-np.asarray(counts), kind="stable")
+    for roll_deg in (it for i in order if (it := rolls_deg[i]) is not None):
         if all(apart_deg(roll_deg, it) > 2 * UPRIGHT_DEG for it in chosen):
             rounded_deg = ROUNDED_DEG * round(roll_deg / ROUNDED_DEG) % 360
             chosen.append(0.0 if apart_deg(roll_deg, 0.0) <= UPRIGHT_DEG else rounded_deg)

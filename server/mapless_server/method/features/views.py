@@ -58,6 +58,10 @@ class Features:
         """Some keypoints, or all, (R, 2) in double precision."""
         return self.keypoints[rows].astype(np.float64)
 
+    def first(self, count: int) -> "Features":
+        """The first features, the strongest ones of a raster."""
+        return Features(self.keypoints[:count], self.descriptors[:count], self.sizes_px[:count])
+
     def every(self, step: int) -> "Features":
         """The features 0, step, 2 step, ..."""
         return Features(self.keypoints[::step], self.descriptors[::step], self.sizes_px[::step])

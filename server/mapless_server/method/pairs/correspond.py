@@ -294,10 +294,14 @@ class Matcher:
         return not is_tried or max(map(len, rematched)) >= options.promising_matches
 
     def rematch(self, query: View, reference: PosedView) -> Matches:
-        """Matches a query with one reference by the `pair_matching`."""
+        """Matches the strongest keypoints of a query with those of one reference by the `pair_matching`."""
         assert self.pair_matching is not None
         begin_s = time.monotonic()
-        matches = self.pair_matching.match_one(query, reference.view)
+        ours, theirs = (
+            replace(view, features=view.features.first(self.options.rematched_keypoints))
+            for view in (query, reference.view)
+        )
+        matches = self.pair_matching.match_one(ours, theirs)
         spent_s = time.monotonic() - begin_s
         usual_s = self.pair_s  # read once: another thread may forget it
         self.pair_s = spent_s if usual_s is None else usual_s + (spent_s - usual_s) / _PAIRS_THAT_COUNT
