@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -40,13 +40,17 @@ from mapless.geometry import RigidTransform as Pose
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.query import CutReason, LadderCut
 from mapless_server.method.judge.hypothesis import Attempt
+from mapless_server.method.options import StageContext
+from mapless_server.scenes import Choice
+from mapless_server.scenes import Selection as Wanted
 from mapless_server.scheduling import Next, Step
-from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call, encode_call
+from mapless_server.security import key_of
+from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CaptureError, decode_call, encode_call
 from mapless_server.services.capture.files import blob_path, calls_of
 from mapless_server.settings import load_settings
 from mapless_tools.child import child_server
 from mapless_tools.replay import report as report_module
-from mapless_tools.replay.recompute import followed, recompute
+from mapless_tools.replay.recompute import RecordedSource, followed, recompute
 from mapless_tools.replay.report import Report, Selection, select
 
 pytestmark = pytest.mark.nightly("replay")
@@ -98,6 +102,15 @@ def calls(client: Client) -> list[Callable[[], Any]]:
         lambda: client.localize_rig(rig, "corner"),
         lambda: client.localize_sequence(walk, "corner", estimate_session_scale=True),
     ]
+
+
+def test_each_kind_of_features_gets_its_own_choice() -> None:
+    upright, rolled = Choice((), "vlad-1-edgepoint2", 1), Choice((), "vlad-1-sift", 1)
+    part = CapturedPart("image", 1, (), (rolled, upright))
+    source = RecordedSource(cast(Any, None), part, cast(Any, None), cast(Any, None), False, "sift")
+    for name, expected in (("edgepoint2", upright), ("aliked", upright), ("sift", rolled)):
+        extractor = cast(Any, SimpleNamespace(name=name))
+        assert source.choose(key_of("", "s"), cast(Any, None), Wanted(1), StageContext(), extractor) is expected
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +179,7 @@ def only(captured: Path, folder: Path, wanted: Callable[[CapturedCall], bool]) -
 
 
 def is_named(call: CapturedCall) -> bool:
-    return [part.choice for part in call.parts] == [None] and len(call.parts[0].references) == len(NAMED)
+    return [part.choices for part in call.parts] == [()] and len(call.parts[0].references) == len(NAMED)
 
 
 def test_a_moved_reference_is_detected(captured: Path, tmp_path: Path) -> None:

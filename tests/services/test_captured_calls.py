@@ -48,12 +48,14 @@ def test_a_call_is_read_as_it_was_written() -> None:
     """To the last bit, NaN among the similarities too."""
     ranked = tuple(RankedReference(f"r{i}", f"key-{i}", value, POSE) for i, value in enumerate((1 / 3, float("nan"))))
     attributes = SceneAttributes(Datum(47.1, 8.2, 400.3), (0.0, 0.0, -1.0))
-    parts = (CapturedPart("images[0].image", 3, (reference(1),), Choice(ranked, "vlad-1", 3)), CapturedPart("b", 4, ()))
+    choices = Choice(ranked, "vlad-1", 3), Choice(ranked[:1], "vlad-2", 3)
+    parts = (CapturedPart("images[0].image", 3, (reference(1),), choices), CapturedPart("b", 4, ()))
     call = replace(a_call(), attributes=attributes, parts=parts, circumstances={"mapless": "1"}, response=b"\x00\xff")
     data = encode_call(call)
     read = decode_call(data)
     assert encode_call(read) == data
     assert (read.request, read.response, read.attributes) == (call.request, call.response, attributes)
+    assert [it.descriptor for it in read.parts[0].choices] == ["vlad-1", "vlad-2"]
     first = read.parts[0].references[0]
     assert first.camera == CAMERA
     np.testing.assert_array_equal(first.world_from_camera.matrix(), POSE.matrix())

@@ -246,6 +246,7 @@ class Result:
         generation: generation of the scene when the references were read.
         processed: the camera of the reduced image that features were found in.
         choice: how the references were chosen; None if the caller named them.
+        other_choices: how other attempts chose theirs by other descriptors, in order.
         attributes: attributes of the scene.
         stage_seconds: time of every stage that was computed, in order, of all attempts. The name of a stage of other
             features, references or rasters than the first ones begins with the extractor's name and a slash.
@@ -259,6 +260,7 @@ class Result:
     generation: int
     processed: Camera
     choice: Choice | None = None
+    other_choices: tuple[Choice, ...] = ()
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
     stage_seconds: dict[str, float] = field(default_factory=dict)
     attempts: tuple[Tried, ...] = ()

@@ -14,7 +14,7 @@ from mapless_server.method.judge.references import supporters_of, with_contradic
 from mapless_server.method.options import DoubtOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.scenes import ANYWHERE
+from mapless_server.scenes import ANYWHERE, Choice
 from mapless_server.store import SceneAttributes
 
 from . import tracking
@@ -113,9 +113,16 @@ class Verdicts:
             material.generation,
             material.view.camera,
             material.choice,
+            _other_choices(search, material),
             search.attributes,
             search.seconds(self.tier(search.attempt).features),
         )
+
+
+def _other_choices(search: Search, material: Material) -> tuple[Choice, ...]:
+    """The choices of all attempts by other descriptors than that of the material's, one each, in order."""
+    chosen = {it.choice.descriptor: it.choice for it in search.materials if it.choice is not None}
+    return tuple(it for name, it in chosen.items() if material.choice is None or name != material.choice.descriptor)
 
 
 def _with_unfinished(answer: Answer, attempts: Sequence[Tried]) -> Answer:

@@ -133,6 +133,7 @@ class RecordedSource:
     """References of one photograph of a captured call and their choice; see `ReferenceSource`.
 
     `is_described` says whether the photograph was described for the choice, which takes a reference to compare it with.
+    `any_roll` names the features that choose references of their own; None if there are none.
     """
 
     call: CapturedCall
@@ -140,6 +141,7 @@ class RecordedSource:
     blobs: Blobs
     extractor: FeatureExtractor
     is_described: bool
+    any_roll: str | None = None
 
     def load(
         self,
@@ -169,16 +171,24 @@ class RecordedSource:
         context: StageContext,
         extractor: FeatureExtractor | None = None,
     ) -> Choice:
-        """The captured choice; of references near a prior only if it was so chosen. DamagedCapture if there is none."""
-        if selection.near is not None and (self.part.choice is None or self.part.choice.descriptor != POSE_PRIOR):
-            return Choice((), POSE_PRIOR, self.part.generation)
-        if self.part.choice is None:
+        """The captured choice, by features for any roll where these choose; near a prior only if it was so chosen.
+
+        DamagedCapture if there is none.
+        """
+        choices = self.part.choices
+        if selection.near is not None:
+            near = (it for it in choices if it.descriptor == POSE_PRIOR)
+            return next(near, Choice((), POSE_PRIOR, self.part.generation))
+        choices = tuple(it for it in choices if it.descriptor != POSE_PRIOR) or choices
+        if not choices:
             raise DamagedCapture("no choice of references was captured")
-        if self.is_described and selection.near is None:
+        if self.is_described:
             views.view(self.extractor, context)
             with context.stage(RETRIEVAL):  # it takes no time, but the answer lists it
                 pass
-        return self.part.choice
+        is_own = {it.descriptor: self.any_roll is not None and it.descriptor.endswith(self.any_roll) for it in choices}
+        wants_own = extractor is not None and extractor.name == self.any_roll
+        return next((it for it in choices if is_own[it.descriptor] == wants_own), choices[0])
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Implements ReferenceSource: the reference was left out in the captured call, too."""
@@ -257,7 +267,8 @@ class _Recomputing:
     def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> SearchJob:
         field = query.photo.field
         extractor, part = self._tiers[0].extractor, self._parts[field]
-        recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._described)
+        any_roll = next((it.features for it in self._tiers if it.any_roll), None)
+        recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._described, any_roll)
         views = QueryViews(query.photo, self.options.image_limits)
         cuts = [(it.rung, it.features) for it in self._then[field].ladder_cuts if it.reason == _CALLER_FAILS]
         search = Search.begin(query, recorded, views, math.inf)

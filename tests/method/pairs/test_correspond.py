@@ -326,7 +326,7 @@ class TestPairMatching:
     SCENE = make_scene(random_for("strong"), SceneOptions(outlier_share=0.3, reference_count=4, descriptor_noise=0.5))
 
     def test_a_query_is_matched_again_with_its_best_references_only(self) -> None:
-        pairs, options = AnyRatio(), CorrespondOptions(rematched_references=2)
+        pairs, options = AnyRatio(), CorrespondOptions(rematched_references=2, rematched_keypoints=10_000)
         matcher = Matcher(options, pair_matching=pairs)
         quick = matcher.match_quickly(self.SCENE.query, self.SCENE.references)
         found = matcher.match_query(self.SCENE.query, self.SCENE.references)
@@ -338,6 +338,12 @@ class TestPairMatching:
             )
         assert len(pairs.seen) == 2
         assert matcher.pair_s is not None
+
+    def test_only_the_strongest_keypoints_are_matched_again(self) -> None:
+        matcher = Matcher(CorrespondOptions(rematched_keypoints=40), pair_matching=AnyRatio())
+        found = matcher.rematch(self.SCENE.query, self.SCENE.references[0])
+        assert len(found)
+        assert found.max() < 40
 
     @pytest.mark.parametrize("matching", TWO)
     def test_a_query_has_no_time_to_make_strong_pairs(self, matching: Matching) -> None:

@@ -107,8 +107,9 @@ def roll_about_axis(roll_deg: float) -> Array:
 def rasters_of(rolls_deg: Sequence[float | None], counts: Sequence[int] | None = None) -> tuple[float, ...]:
     """The angles, degrees clockwise in [0, 360), by which to turn a photograph with these rolls to references.
 
-    Those whose roll is None are left out. The references with the most matches come first, whose angles the rasters have; the others are within twice
-    `UPRIGHT_DEG` of one, if the largest number of rasters suffices. Empty if the photograph as it is suffices.
+    Those whose roll is None are left out. The references with the most matches come first, whose angles the rasters
+    have; the others are within twice `UPRIGHT_DEG` of one, if the largest number of rasters suffices. Empty if the
+    photograph as it is suffices.
     """
     chosen: list[float] = []
     order = range(len(rolls_deg)) if counts is None else np.argsort(-np.asarray(counts), kind="stable")

@@ -79,14 +79,14 @@ class CapturedReference:
 class CapturedPart:
     """The named or ranked references that one photograph of a call was compared with, at a generation of the scene.
 
-    The field is the photograph's path in the request, "image" or "images[2].image"; the choice is None if the caller
-    named the references.
+    The field is the photograph's path in the request, "image" or "images[2].image". The choices are that of the answer
+    and those by other descriptors; none if the caller named the references.
     """
 
     field: str
     generation: int
     references: tuple[CapturedReference, ...]
-    choice: Choice | None = None
+    choices: tuple[Choice, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,38 +187,41 @@ def _attributes_of(content: object) -> SceneAttributes:
 
 
 def _part_to_dict(part: CapturedPart) -> dict[str, Any]:
-    choice = part.choice
+    choice, *others = map(_choice_to_dict, part.choices) if part.choices else (None,)
     return {
         "field": part.field,
         "generation": part.generation,
         "references": [_reference_to_dict(it) for it in part.references],
-        "choice": choice
-        and {
-            "descriptor": choice.descriptor,
-            "generation": choice.generation,
-            "references": [
-                {
-                    "reference_id": it.reference_id,
-                    "key": it.key,
-                    "similarity": it.similarity,
-                    "rotation": it.world_from_camera.rotation.tolist(),
-                    "translation": it.world_from_camera.translation.tolist(),
-                }
-                for it in choice.references
-            ],
-        },
+        "choice": choice,
+        "other_choices": others,
     }
 
 
 def _part_of(content: Mapping[str, Any]) -> CapturedPart:
-    references, choice = tuple(map(_reference_of, content["references"])), content["choice"]
-    if choice is not None:
-        ranked = tuple(
-            RankedReference(it["reference_id"], it["key"], it["similarity"], _pose_of(it))
-            for it in choice["references"]
-        )
-        choice = Choice(ranked, choice["descriptor"], choice["generation"])
-    return CapturedPart(content["field"], content["generation"], references, choice)
+    choices = [it for it in (content["choice"], *content.get("other_choices", ())) if it is not None]
+    references = tuple(map(_reference_of, content["references"]))
+    return CapturedPart(content["field"], content["generation"], references, tuple(map(_choice_of, choices)))
+
+
+def _choice_to_dict(choice: Choice) -> dict[str, Any]:
+    ranked = [
+        {
+            "reference_id": it.reference_id,
+            "key": it.key,
+            "similarity": it.similarity,
+            "rotation": it.world_from_camera.rotation.tolist(),
+            "translation": it.world_from_camera.translation.tolist(),
+        }
+        for it in choice.references
+    ]
+    return {"descriptor": choice.descriptor, "generation": choice.generation, "references": ranked}
+
+
+def _choice_of(content: Mapping[str, Any]) -> Choice:
+    ranked = tuple(
+        RankedReference(it["reference_id"], it["key"], it["similarity"], _pose_of(it)) for it in content["references"]
+    )
+    return Choice(ranked, content["descriptor"], content["generation"])
 
 
 def _reference_to_dict(reference: CapturedReference) -> dict[str, Any]:

@@ -26,25 +26,24 @@ class UsedReferences:
     """What a photograph was compared with, by key only, so that a queued call needs little memory.
 
     `used` are the keys of the references that the answer was computed from, `wanted` those, by id, of the references
-    that were named or ranked. Field, generation and choice are as of `CapturedPart`.
+    that were named or ranked. Field, generation and choices are as of `CapturedPart`.
     """
 
     field: str
     generation: int
     used: frozenset[str]
     wanted: Mapping[str, str]
-    choice: Choice | None
+    choices: tuple[Choice, ...]
 
 
 def used_references(query: Query, result: Result) -> UsedReferences:
     """Extracts what an answered photograph was compared with."""
-    choice = result.choice
-    if choice is not None:
-        wanted = {it.reference_id: it.key for it in choice.references}
-    else:
+    choices = () if result.choice is None else (result.choice, *result.other_choices)
+    wanted = {it.reference_id: it.key for choice in choices for it in choice.references}
+    if not choices:
         wanted = {parse_reference_name(it.name)[1]: it.key for it in result.references}
     used = frozenset(it.key for it in result.references)
-    return UsedReferences(query.photo.field, result.generation, used, wanted, choice)
+    return UsedReferences(query.photo.field, result.generation, used, wanted, choices)
 
 
 class Collector:
@@ -69,7 +68,7 @@ class Collector:
         if not used.used and used.generation != scene.generation:
             raise ReferencesDeleted
         wanted = dict(used.wanted)
-        read_at = {used.generation, used.generation if used.choice is None else used.choice.generation}
+        read_at = {used.generation, *(it.generation for it in used.choices)}
         if read_at != {scene.generation}:
             current = self._store.find_keys(scene.scene_key, list(wanted))
             wanted = {it: key for it, key in wanted.items() if current.get(it) == key}
@@ -97,7 +96,7 @@ class Collector:
             )
             for key, it in known.items()
         ]
-        return CapturedPart(used.field, used.generation, tuple(references), used.choice)
+        return CapturedPart(used.field, used.generation, tuple(references), used.choices)
 
     def _read(self, scene_key: SceneKey, wanted: Mapping[str, str], extractor: str, blobs: dict[str, bytes]) -> None:
         """Reads an extractor's features that exist and whose blobs are missing."""
