@@ -44,7 +44,7 @@ SHORTLIST = 2
 """So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
 BENCHMARKS.md)."""
 
-MIRROR_REFERENCES = 10
+MIRROR_REFERENCES = 5
 """A photograph and its mirror image are compared with so many references, the most similar first."""
 
 MIRRORED_BY_CHANCE = 1e-6
@@ -196,7 +196,8 @@ def _outside(search: Search, choice: Choice, tier: Tier) -> list[tuple[str, int]
     """Ids of references that resemble the photograph and were not chosen, with their rank among all."""
     inside = {it.reference_id for it in choice.references}
     with search.context.stage("retrieval"):
-        alike = _shortlisted(search, search.views, search.query.narrowing.limits, tier).references
+        views = search.views if search.material is None else search.material.views
+        alike = _shortlisted(search, views, search.query.narrowing.limits, tier).references
     return [(it.reference_id, rank) for rank, it in enumerate(alike) if it.reference_id not in inside]
 
 

@@ -54,6 +54,9 @@ WITHOUT_WEIGHTS = "sift"
 ANY_ROLL = WITHOUT_WEIGHTS
 """The features that match however the camera is rolled; the others must be upright."""
 
+ANY_ROLL_PIXELS = 640 * 480
+"""Where these follow others, they are found in a photograph of so many pixels. Evidence: any-roll-pixels."""
+
 CPU_TIERS = ((BEST_VARIANTS["edgepoint2"], WITHOUT_WEIGHTS), (ANY_ROLL,), ("aliked",))
 GPU_TIERS = (("aliked", BEST_VARIANTS["edgepoint2"], WITHOUT_WEIGHTS), (ANY_ROLL,))
 """The features of `auto`, of each tier the best first, of which the first that can be used is; all licences are free.
@@ -256,7 +259,13 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     )
     uses_depths = settings.reference_depth != OFF and reconstructor.uses_correspondences
     return tuple(
-        Tier(extractor, Pipeline(reconstructor, matchers[name]), uses_depths, any_roll=name == ANY_ROLL)
+        Tier(
+            extractor,
+            Pipeline(reconstructor, matchers[name]),
+            uses_depths,
+            any_roll=name == ANY_ROLL,
+            max_pixels=ANY_ROLL_PIXELS if name == ANY_ROLL != first else None,
+        )
         for name, extractor in extractors.items()
     )
 

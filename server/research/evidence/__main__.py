@@ -23,6 +23,8 @@ MODULES = {
     "handshake": ("handshake",),
     "accused": ("accusation-chance",),
     "worth": ("rungs-worth", "place-agreement"),
+    "any_roll": ("any-roll-pixels",),
+    "network_matches": ("rematched-keypoints", "promising-matches"),
 }
 """The keys that each module measures, by `measure(key, scenes)`, which returns the question and its rows."""
 

@@ -193,7 +193,7 @@ class CorrespondOptions:
     rematched_references: int = 5
     rematched_keypoints: int = 512
     promising_references: int = 2
-    promising_matches: int = 20
+    promising_matches: int = 30
     enough_matches: int = 500
     remembered_pairs: int = 20_000
     structure_bytes: int = 32 * 2**20

@@ -1,0 +1,102 @@
+"""How large the raster must be in which features for any roll of the camera are found."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mapless_server.engine.photo_views import QueryViews, RasterForm
+from mapless_server.engine.query import Photo
+from mapless_server.images import ImageLimits, decode_image
+from mapless_server.method.features.extractors import make_extractor
+from mapless_server.method.features.rolls import similarity_of
+from mapless_server.method.features.views import PosedView
+from mapless_server.method.options import StageContext
+from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.promise import PROMISE
+from mapless_tools.dataset import Frame
+from mapless_tools.evaluate.plan import evenly_spread
+from research.contradictions.places import Place, place_reader
+from research.doubt.scenes import FOLDERS, PLACES
+from research.doubt.turning import turned, turned_image
+
+from .page import Question, Row
+
+QUESTION = Question(
+    "any-roll-pixels",
+    "mapless_server.serve.assembly:ANY_ROLL_PIXELS",
+    "In how many pixels of a photograph must SIFT be found, which follows other features?",
+    "two photographs of each folder of shared/data, turned by 45 degrees, and one of another place, with 5 references "
+    "that are evenly spread and have SIFT of the whole photograph. Two references agree if the photograph's matches "
+    f"with both have an agreement of {PROMISE.agreement:g} (see place-agreement).",
+    "As many photographs as with all pixels have two references that agree, at the lowest cost.",
+)
+PIXELS = (320 * 240, 480 * 360, 640 * 480, 960 * 720, None)
+ANGLE_DEG = 45
+QUERIES, FEW = 2, 5
+CONTEXT = StageContext()
+
+
+@dataclass(frozen=True)
+class Found:
+    """The second largest agreement of a photograph with references, and the processor time of features and matches."""
+
+    is_own: bool
+    max_pixels: int | None
+    agreement: float
+    seconds: float
+
+
+def measure(key: str, scenes: Path) -> tuple[Question, Iterator[Row]]:
+    """The question, and the rows of its table."""
+    return QUESTION, iter(rows(list(_all_found(scenes))))
+
+
+def rows(found: Sequence[Found]) -> Iterator[Row]:
+    """For each size, the photographs with two references that agree, and the time."""
+    for max_pixels in PIXELS:
+        own, other = ([it for it in found if it.max_pixels == max_pixels and it.is_own is own] for own in (True, False))
+        agreeing = [sum(it.agreement >= PROMISE.agreement for it in some) for some in (own, other)]
+        yield {
+            "pixels": max_pixels or "all",
+            "of the place": f"{agreeing[0]} of {len(own)}",
+            "of other places": f"{agreeing[1]} of {len(other)}",
+            "processor s, median": f"{np.median([it.seconds for it in (*own, *other)]):.2f}",
+        }
+
+
+def _all_found(scenes: Path) -> Iterator[Found]:
+    of = place_reader(scenes)
+    for number, folder in enumerate(FOLDERS):
+        place = of(folder, FEW)
+        foreign = [it for it in FOLDERS if not any({it, folder} <= set(one) for one in PLACES)]
+        other = of(foreign[(5 * number + 3) % len(foreign)], FEW).dataset.frames[0]
+        yield from _found(place, [*((it, True) for it in _queries(place)), (other, False)])
+
+
+def _queries(place: Place) -> Sequence[Frame]:
+    others = [it for it in place.dataset.frames if it not in place.reference_frames]
+    return [others[i] for i in evenly_spread(range(len(others)), min(QUERIES, len(others)))]
+
+
+def _found(place: Place, asked: Sequence[tuple[Frame, bool]]) -> Iterator[Found]:
+    extractor, matcher = make_extractor("sift"), make_matcher("sift", 1)
+    read = ((decode_image(it.image_path.read_bytes(), ImageLimits()), it) for it in place.reference_frames)
+    references = [
+        PosedView(it.name, it.name, extractor.extract(pixels, it.camera), it.world_from_camera) for pixels, it in read
+    ]
+    for frame, is_own in asked:
+        camera, _ = turned(frame.camera, frame.world_from_camera, ANGLE_DEG)
+        photo = Photo(turned_image(frame.image_path, frame.camera, ANGLE_DEG), camera, "image")
+        for max_pixels in PIXELS:
+            views = QueryViews(photo, ImageLimits()).in_form(RasterForm(max_pixels=max_pixels))
+            begin_s = time.process_time()
+            view = views.view(extractor, CONTEXT)
+            matches = matcher.match_quickly(view, references)
+            seconds = time.process_time() - begin_s
+            shown = [similarity_of(view, it.view, some) for it, some in zip(references, matches, strict=True)]
+            agreement = sorted(it.agreement if it else 0.0 for it in shown)[-2]
+            yield Found(is_own, max_pixels, agreement, seconds)
+    matcher.close()
