@@ -1,8 +1,9 @@
 """Whether a further attempt is worth its processor time: what it can be expected to gain, from what is known already.
 
-A photograph of another place matches every reference by chance, whatever features are used, and an accepted pose that
-two kinds of features have found is right. So the expensive attempts are made where something is to be gained: the
-chance that they help, times the share of photographs that they help, for each second that they take.
+A photograph of another place matches every reference by chance, whatever features are used; one that matches a single
+reference gets no pose by better matches; and an accepted pose that two kinds of features have found is right. So the
+expensive attempts are made where something is to be gained: the chance that they help, times the share of photographs
+that they help, for each second that they take.
 """
 
 import math
@@ -18,7 +19,8 @@ class Worth:
 
     Attributes:
         cost_s: processor time of a core, seconds; of `rematched`, with the first two references.
-        found: share of the photographs of the place without an accepted pose that it, or what follows it, answers.
+        found: share of the photographs without an accepted pose, but with references that agree, that it, or what
+            follows it, answers.
         corrected: share of the wrong answers that it, or what follows it, corrects; None if it also makes right answers
             more accurate, so that it is always made where a pose is accepted.
     """
@@ -33,12 +35,12 @@ class Worth:
 
 
 WORTH: Mapping[str, Worth] = {
-    "wide": Worth(0.15, 0.05, None),
-    "lines": Worth(0.4, 0.1, 0.0),
+    "wide": Worth(0.15, 0.12, None),
+    "lines": Worth(0.4, 0.2, 0.0),
     "lines at any roll": Worth(0.4, 0.007, 0.0),
     "wide at any roll": Worth(0.15, 0.03, 0.1),
-    "stronger": Worth(1.6, 0.15, 0.3),
-    "rematched": Worth(2.0, 0.12, 0.2),
+    "stronger": Worth(2.0, 0.4, 0.3),
+    "rematched": Worth(1.0, 0.3, 0.2),
 }
 """By the name of the rung; those that are not listed are always worth it. Evidence: rungs-worth, rungs."""
 
@@ -48,8 +50,8 @@ class PromiseOptions:
     """When an attempt is worth its time.
 
     Attributes:
-        agreement, spread: the chance that a photograph shows the place is a logistic function of the agreement of its
-            matches with two references (see `features.rolls`); it is a half at the one, and rises over the other.
+        agreement, spread: the chance that a photograph shows what two references show is a logistic function of the
+            agreement of its matches with both (see `features.rolls`): a half at the one, rising over the other.
         wrong_of_low_trust, wrong_otherwise: shares of the accepted poses that are wrong.
         wrong_if_confirmed: share of these that remains for each further kind of features that finds the same place.
         least_gain_per_s: photographs that a second of processor time must be expected to gain.
@@ -89,7 +91,7 @@ class Known:
     kinds: int = 1
 
     def chance_of_place(self, options: PromiseOptions = PROMISE) -> float:
-        """The chance that the photograph shows the place."""
+        """The chance that the photograph shows what two references show."""
         return 1 / (1 + math.exp(min(50.0, (options.agreement - self.agreement) / options.spread)))
 
     def chance_wrong(self, options: PromiseOptions = PROMISE) -> float:

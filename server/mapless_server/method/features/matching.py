@@ -173,9 +173,10 @@ class CorrespondOptions:
             all.
         rematched_references: so many references of a query, those with the most matches, are matched again by a
             `PairMatching`, if there is one.
-        rematched_keypoints: so many keypoints of each photograph, the strongest, are matched again.
+        rematched_keypoints: so many keypoints of each photograph, the strongest, are matched again. Evidence:
+            rematched-keypoints.
         promising_references, promising_matches: if it finds fewer matches with each of so many, the others are not
-            matched.
+            matched. Evidence: promising-matches.
         enough_matches: pairs of references for which nearest neighbours find so many are not matched by it.
         remembered_pairs: number of cached pairs of references, about 8 KiB each.
         structure_bytes: memory of the cached structures of sets of references, about 0.25 MB for ten at 640x480.
