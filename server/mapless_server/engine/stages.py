@@ -140,27 +140,29 @@ class QueryStages:
         try:
             return compute(search)
         except Exception as error:
-            if isinstance(error, Abandoned) or failure_of(error) is Failure.DEVICE_LOST:
-                return error
-            # A reference deleted since the scene was listed was not the caller's choice: the next list is without it.
-            is_outdated = isinstance(error, NotFound) and error.field != "scene" and not search.query.reference_ids
-            if is_outdated and search.listings < MAX_LISTINGS:
-                again = replace(search, listings=search.listings + 1, material=None, coarse=None)
-                return self._next(again, again.first_step)
-            if search.verdict is None:
-                if not is_outdated:
-                    return error
-                return Unavailable(
-                    "the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0
-                )
-            if isinstance(error, FeaturesMissing):  # which the library makes after the call
-                features = self._verdicts.tier(search.attempt).features
-                return self._skipped(search.cut(search.rung, features, CutReason.FEATURES_MISSING), "unfinished")
-            # A failed attempt at a better answer must not cost the answer that there is.
-            log.warning("the attempt %r failed; the answer before it is given", search.rung, exc_info=error)
-            is_full = failure_of(error) is Failure.OUT_OF_MEMORY
-            reason = CutReason.OUT_OF_MEMORY if is_full else CutReason.FAILED
-            return self._unfinished(search, reason.value, reason)
+            failure = error
+        if isinstance(failure, Abandoned) or failure_of(failure) is Failure.DEVICE_LOST:
+            return failure
+        # A reference deleted since the scene was listed was not the caller's choice: the next list is without it.
+        is_outdated = isinstance(failure, NotFound) and failure.field != "scene" and not search.query.reference_ids
+        if is_outdated and search.listings < MAX_LISTINGS:
+            again = replace(search, listings=search.listings + 1, material=None, coarse=None)
+            return self._next(again, again.first_step)
+        if search.verdict is not None:
+            return self._without_attempt(search, failure)
+        if not is_outdated:
+            return failure
+        return Unavailable("the scene's references are being deleted", reason="SCENE_CHANGED", retry_after_s=1.0)
+
+    def _without_attempt(self, search: Search, failure: Exception) -> SearchResult:
+        """Goes on without an attempt that failed: it must not cost the answer that there is."""
+        if isinstance(failure, FeaturesMissing):  # which the library makes after the call
+            features = self._verdicts.tier(search.attempt).features
+            return self._skipped(search.cut(search.rung, features, CutReason.FEATURES_MISSING), "unfinished")
+        log.warning("the attempt %r failed; the answer before it is given", search.rung, exc_info=failure)
+        is_full = failure_of(failure) is Failure.OUT_OF_MEMORY
+        reason = CutReason.OUT_OF_MEMORY if is_full else CutReason.FAILED
+        return self._unfinished(search, reason.value, reason)
 
     def _prepare(self, search: Search, job: SearchJob) -> SearchResult:
         attempt = search.attempt

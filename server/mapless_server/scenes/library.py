@@ -141,12 +141,10 @@ class ReferenceLibrary:
         """Describes one reference; one that is damaged is not tried again, one that the store did not take now is."""
         try:
             self._describe_all([record], extractor, lambda: None)
-        except Unavailable as error:
-            log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_key, error)
+        except Unavailable:
             with self._scheduling:
                 self._scheduled.discard((record.key, extractor.name))
-        except Exception as error:  # it must not keep the others from being described
-            log.warning("reference %s of scene %s: %s", record.reference_id, record.scene_key, error)
+            raise
 
     def later(self, describe: Callable[[], None]) -> None:
         """Describes in the background, after what is to be described already."""
