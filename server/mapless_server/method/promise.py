@@ -58,7 +58,7 @@ class PromiseOptions:
     """
 
     agreement: float = 3.0
-    spread: float = 0.15
+    spread: float = 0.25
     wrong_of_low_trust: float = 0.29
     wrong_otherwise: float = 0.01
     wrong_if_confirmed: float = 0.1
