@@ -40,8 +40,7 @@ from mapless_tools.cli.app import app
 
 SERVER, CLIENT = Path(errors.__file__).parent, Path(client_errors.__file__).parent
 DOCS, DEPLOY = ROOT / "docs", ROOT / "deploy"
-PAST = ("CHANGELOG.md", "history.md", "city.md")
-CURRENT = "\n".join(written(page) for page in PAGES if page.name not in PAST)
+CURRENT = "\n".join(written(page) for page in PAGES if page.name != "CHANGELOG.md")
 
 
 def page_id(page: Path) -> str:
