@@ -11,7 +11,7 @@ DOUBTFUL_TRUST = 0.15
 """Below it, an answer looks worse than 17 of 20 right ones of difficult places: the intrinsics may be wrong."""
 
 _FIELDS = {"FOCAL_LENGTH": "focal_x_px", "PRINCIPAL_X": "principal_x_px", "PRINCIPAL_Y": "principal_y_px", "K1": "k1"}
-"""Of CameraIntrinsics, as rejections name them, by parameter."""
+"""Fields of CameraIntrinsics by the names that rejections give their parameters."""
 _CAPTURED = "captured by the server"
 
 
@@ -36,7 +36,7 @@ class Accuracy:
 
     @property
     def calibrated_by(self) -> str:
-        """What the radii were calibrated by, as a phrase for a person."""
+        """The source of the radii's calibration, as a phrase for a person."""
         if self.calibration == "SELF":
             return f"by {self.sample_size} references"
         if self.calibrated:
@@ -191,7 +191,7 @@ class LocalizationResult:
         intrinsics_checks: comparison of each intrinsic parameter with the photograph; empty for a pose without
             refinement.
         arbitrary_unit: whether lengths are in the scene's own, arbitrary unit, also where a name says metres.
-        scale_source: what its lengths rest on: "REFERENCES", or "NETWORK" for a single reference.
+        scale_source: the basis of its lengths: "REFERENCES", or "NETWORK" for a single reference.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
             ran out of time, or the first of `localize_progressively` with it.
         inlier_count, match_count: number of 2D-3D matches that agree with the pose, and of all matches.

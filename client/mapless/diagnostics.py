@@ -42,7 +42,7 @@ class Attempt:
     """One attempt at the pose of a photograph.
 
     Attributes:
-        rung: what was done differently from the other attempts, "wide" for instance.
+        rung: the difference from the other attempts, "wide" for instance.
         features: the local features used.
         outcome: "localized", the reason of its rejection, such as "too_few_matches", or how it ended without a verdict:
             "unfinished", "out_of_memory" or "failed".

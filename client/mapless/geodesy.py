@@ -78,7 +78,7 @@ class Datum:
     """Position and orientation of a scene's world on the Earth.
 
     Attributes:
-        latitude_deg, longitude_deg, height_m: of the world's origin, WGS84, height above the ellipsoid.
+        latitude_deg, longitude_deg, height_m: position of the world's origin, WGS84, height above the ellipsoid.
         enu_from_world: rotation of the world's axes to east, north and up at its origin; by default the identity.
     """
 

@@ -25,7 +25,7 @@ from .lenses import Distortion
 Array = NDArray[np.float64]
 
 MAX_COORDINATE_M = 1e7
-"""Of a stored pose: the Earth's centre is not as far from anything on it."""
+"""Largest coordinate of a stored pose: the Earth's centre is not as far from anything on it."""
 
 ROTATION_TOLERANCE = 1e-3
 """How far a given rotation may be from orthonormal (or a quaternion's norm from 1) before it is rejected."""

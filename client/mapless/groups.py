@@ -145,7 +145,7 @@ class SequenceLocalization:
         inlier_count, match_count: number of 2D-3D matches of all photographs that agree with the poses, and of all.
         reprojection_error_px: median of the inliers, pixels of the processed images.
         images: contribution of each photograph, in order.
-        axes: of `world_from_session`, "OPENCV".
+        axes: axes of `world_from_session`, "OPENCV".
         arbitrary_unit: as of `LocalizationResult`.
         jumps: where the photographs contradict the tracking, in order. `world_from_session`, covariance, accuracy and
             trust are of the photographs since the last one.

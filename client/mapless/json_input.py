@@ -102,7 +102,7 @@ def _fill(message: Any, content: Any, path: str, shown_path: str, written: dict[
 
 def _suggestion(key: str, message: Any) -> str:
     names = [it.name for it in message.DESCRIPTOR.fields]
-    # A name without its unit is the beginning of the right one, and as close to others: focal_x to focal_y_px.
+    # `focal_x` lacks its unit. Try prefixes first: by edit distance focal_y_px is as near as focal_x_px.
     nearest = [it for it in names if it.startswith(key)] or difflib.get_close_matches(key, names, 1)
     return f", perhaps {nearest[0]}; known: {', '.join(names)}" if nearest else f"; known: {', '.join(names)}"
 

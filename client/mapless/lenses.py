@@ -30,7 +30,7 @@ class Distortion(ABC):
     @property
     @abstractmethod
     def cubic(self) -> float:
-        """What r^3 is multiplied by in the distance at which the lens shows a ray of slope r; for a pinhole 0.
+        """The factor of r^3 in the distance at which the lens shows a ray of slope r; for a pinhole 0.
 
         As a share of what r is multiplied by, where that is not 1.
         """
@@ -123,7 +123,7 @@ LENS_MODELS: Mapping[str, type[Any]] = {"radial_tangential": RadialTangential, "
 names, and the names of the coefficients; another model begins here."""
 
 DEFAULT_LENS_MODEL = "radial_tangential"
-"""Of a cameras.json that names none; the last coefficient, k3, may be left out there, as in OpenCV."""
+"""Lens of a cameras.json that names none; the last coefficient, k3, may be left out there, as in OpenCV."""
 
 
 def lens_model_of(lens: object) -> str:

@@ -140,7 +140,7 @@ _READERS: dict[Any, Callable[[Any, str], Any]] = {
     Vector: direction_from_message,
     datetime: lambda timestamp, path: timestamp.ToDatetime(timezone.utc),
 }
-"""Of types whose messages have other fields, or bounds."""
+"""Readers of types whose messages have other fields, or bounds."""
 
 
 def answer_from_message(message: pb.LocalizeResponse) -> LocalizationResult | Rejected:

@@ -19,7 +19,7 @@ _TOKEN = re.compile(r"[!-~]{1,4096}", re.ASCII)
 _FIRST_RECONNECT_MS = 200
 _TIMES = ("timeout_s", "upload_timeout_s", "connect_timeout_s", "max_reconnect_s", "keepalive_s", "keepalive_timeout_s")
 _MAX_CONNECT_S = 20.0
-"""gRPC's own limit of an attempt to connect."""
+"""Longest attempt to connect, by gRPC's own limit."""
 _CLIENT_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)  # it enters the server's log
 
 

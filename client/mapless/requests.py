@@ -32,9 +32,9 @@ class IntrinsicsUncertainty:
     """Standard deviations of a photograph's intrinsics; 0 for the server's default.
 
     Attributes:
-        focal_sigma_px: of both focal lengths together, pixels along x; by default 0.3 % of it.
-        principal_sigma_px: of each coordinate of the principal point; by default 0.3 % of the width.
-        k1_sigma: of the first distortion coefficient; by default 0.01.
+        focal_sigma_px: standard deviation of both focal lengths together, pixels along x; by default 0.3 % of it.
+        principal_sigma_px: standard deviation of each coordinate of the principal point; by default 0.3 % of the width.
+        k1_sigma: standard deviation of the first distortion coefficient; by default 0.01.
     """
 
     focal_sigma_px: float = 0.0

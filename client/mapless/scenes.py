@@ -47,8 +47,8 @@ class Calibration:
     of another method or server version than measured remain uncalibrated.
 
     Attributes:
-        position_factor_68, position_factor_95: of the position's radii at 68 and 95 %, 0.01 to 1000.
-        rotation_factor_68, rotation_factor_95: of the angle's.
+        position_factor_68, position_factor_95: factors of the position's radii at 68 and 95 %, 0.01 to 1000.
+        rotation_factor_68, rotation_factor_95: factors of the angle's.
         query_count: number of photographs measured, at least 1.
         features, backend, variant: method of their answers, as in `Diagnostics` ("BEST").
         server_version: version of the measured server.

@@ -351,7 +351,7 @@ def _read_environment() -> dict[str, str]:
     unknown = {name for name in ours if name.upper() not in known}
     if unknown:
         raise ConfigError("\n".join(_unknown("environment", name, known) for name in sorted(unknown)))
-    # In any case; of two spellings the one in capitals, which sort first, counts.
+    # Upper or lower case. If both are set, upper case wins, because it sorts first.
     given = {variable: os.environ[variable] for variable in sorted(ours, reverse=True)}
     values = {variables[name.upper()]: value for name, value in given.items() if name.upper() in variables}
     if values.get("port", "").startswith(_SERVICE_LINK_VALUE):

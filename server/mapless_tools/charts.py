@@ -17,7 +17,7 @@ COLOURS = ("#2f7bd0", "#d2601f", "#239464", "#bd479c", "#97801c", "#8467d8", "#d
 """Readable on white and on black. Neighbours differ in their dashes, too."""
 DASHES = ("-", (0, (6, 2)), (0, (8, 2, 2, 2)), (0, (3, 1.5)))
 INK = "#0c0b0d"
-"""Of text and axes; `inline_svg` replaces it by the colour of the text around the chart."""
+"""Colour of text and axes; `inline_svg` replaces it by the colour of the text around the chart."""
 _STYLE: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with matplotlib: no font is searched or fetched
     "font.size": 9,

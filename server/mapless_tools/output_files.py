@@ -1,4 +1,4 @@
-"""What commands write: JSON for programs, tables, and HTML reports that need nothing else and run no scripts."""
+"""The files that commands write: JSON for programs, tables, and self-contained HTML reports without scripts."""
 
 import json
 import math

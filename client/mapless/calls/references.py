@@ -313,7 +313,7 @@ async def audit_scene(
 
     Args:
         scene: the scene.
-        references: which references, at most 100; empty for all.
+        references: ids of references, at most 100; empty for all.
         page_size: references per call, about half a second of computation each; 0 for the server's default.
         timeout_s: deadline of each call.
     """

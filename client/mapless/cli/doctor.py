@@ -30,9 +30,10 @@ _CALL_LIMIT_S = 10.0
 _QUERY_LIMIT_S = 30.0
 _PROXY_LIMIT_S = 3.0
 _MAX_OFFSET_S = 5.0
-"""Of two clocks. Certificates and tokens expire, and times of captures are compared, by minutes at the least."""
+"""Largest offset of two clocks. Certificates and tokens expire, and times of captures are compared, by minutes at the
+least."""
 _MAX_ERROR = 0.05
-"""Of a reference's photograph, which is matched with itself, from its stored pose; metres or units."""
+"""Largest error of a reference's photograph, matched with itself, from its stored pose; metres or units."""
 _TIME_KEY, _CONNECTIONS_KEY = "x-mapless-time", "x-mapless-connections"
 _ARITHMETIC_KEY = "x-mapless-arithmetic"
 _FEW_CONNECTIONS = 4096
@@ -54,7 +55,7 @@ class Finding:
 
 @dataclass
 class _Session:
-    """What the checks share; `trailers` and `clock_error_s` are known after `_check_token`."""
+    """Values that the checks share; `trailers` and `clock_error_s` are known after `_check_token`."""
 
     client: Client
     scene: str | None

@@ -35,7 +35,8 @@ def write_report(
         image: the photograph as it was sent, or a smaller copy of it.
         camera: as it was sent.
         path: the file; an existing one is replaced.
-        references: of the scene, for the plan view; the best of those with images are shown beside the photograph.
+        references: references of the scene, for the plan view; the best of those with images are shown beside the
+            photograph.
         title: for example the names of photograph and scene.
         down_in_world: direction of gravity in the scene; None to estimate it from the cameras.
 

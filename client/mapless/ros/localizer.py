@@ -21,7 +21,8 @@ from .cameras import RosCamera
 from .poses import pose_of_body, stamp_ns_of, time_of, transform_from_pose
 
 Lookup = Callable[[str, str, int], RigidTransform]
-"""target_from_source of two frames at a stamp, nanoseconds, 0 for the latest; LookupError if tf does not know it."""
+"""Function that gives target_from_source of two frames at a stamp, nanoseconds, 0 for the latest; LookupError if tf
+does not know it."""
 
 _Answer = LocalizationResult | SequenceLocalization | Rejected
 
@@ -29,7 +30,7 @@ LOCALIZED, NOT_LOCALIZED, FAILED = "OK", "WARN", "ERROR"
 """Levels of an outcome, named as those of diagnostic_msgs/DiagnosticStatus."""
 
 UNSTATED_SIGMA_M, UNSTATED_SIGMA_RAD = 1.0, 0.2
-"""Of an initial pose's variances that are 0, as rviz leaves those of height, roll and pitch."""
+"""Standard deviations for an initial pose's variances that are 0, as rviz leaves those of height, roll and pitch."""
 
 LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.02, 0.01
 """Added to a guess that odometry has moved: clocks and extrinsics are never exact."""

@@ -25,7 +25,7 @@ class RejectionReason(str, Enum):
 
 
 class Advice(str, Enum):
-    """What would help after a rejection."""
+    """The kinds of advice after a rejection."""
 
     ADD_REFERENCES = "add_references"
     """Name references, or add some to the scene."""
@@ -87,7 +87,7 @@ class IntrinsicsCheck:
 
 @dataclass(frozen=True)
 class Hint:
-    """What would help after a rejection.
+    """Advice after a rejection: what would help.
 
     Attributes:
         stage: the stage that failed, named as in the timings; empty if none began.
@@ -126,9 +126,10 @@ class Rejection:
     Attributes:
         reason: for programs.
         message: one sentence for a person, with the numbers that decided.
-        hint: what would help; None until `hints` has added it.
+        hint: advice on what would help; None until `hints` has added it.
         tried: number of 2D-3D matches that were used; None if there are none yet.
-        intrinsics_checks: what the matches say of the intrinsics; empty unless a conflict with them is the reason.
+        intrinsics_checks: evidence of the matches about the intrinsics; empty unless a conflict with them is the
+            reason.
         hypotheses: the poses that explain it, the better supported first; empty unless AMBIGUOUS.
         imprecise: the pose that is rejected for its radius alone, with covariance; None if there is more against it.
     """

@@ -37,7 +37,7 @@ def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
 
     Args:
         coarse: the reconstruction of the attempt's basis, with priors if there are any.
-        attempt: what to change in it.
+        attempt: the changes of the attempt.
         doubt: when the pose is doubtful.
     """
     if attempt.solver is Solver.LINES:

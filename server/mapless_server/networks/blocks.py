@@ -13,9 +13,9 @@ import torch.nn.functional as F  # noqa: N812  its usual name
 from torch import Tensor, nn
 
 BLOCK_EPS = 1e-6
-"""Of the normalizations in front of attention and MLP."""
+"""Epsilon of the normalizations in front of attention and MLP."""
 QK_EPS = 1e-5
-"""Of the normalizations of queries and keys."""
+"""Epsilon of the normalizations of queries and keys."""
 
 
 class Linear(nn.Linear):

@@ -48,7 +48,7 @@ VARIANTS: Mapping[str, Widths] = {
     "l64": Widths(8, 16, 48, 64, 8),
     "e64": Widths(16, 16, 48, 64, 16),
 }
-"""Of the official weights, the cheapest first."""
+"""Widths of the official weights' networks, the cheapest first."""
 
 
 class Convolution(nn.Module):

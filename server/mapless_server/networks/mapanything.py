@@ -38,11 +38,11 @@ from .view_conditions import (
 )
 
 CHANNELS = 6
-"""Of the dense head: ray, logarithm of the depth, confidence, mask."""
+"""Channels of the dense head: ray, logarithm of the depth, confidence, mask."""
 DENSE_VIEWS = 5
 """Views whose pixels are computed at a time: each takes 0.35 GB at 518x392."""
 HIDDEN_LOGIT = -1e4
-"""Of the confidence where the network masks a pixel: its sigmoid is 0."""
+"""The confidence's logit where the network masks a pixel: its sigmoid is 0."""
 
 V1_WIDTH = 768
 """Channels of a token in version 1 of the network."""

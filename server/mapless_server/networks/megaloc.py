@@ -22,7 +22,7 @@ from .encoder import PatchEmbedding, PlainEncoder
 from .network import IMAGE_MEAN, IMAGE_STD, patch_grid
 
 ROUNDS = 3
-"""Of the Sinkhorn iteration; the published weights were trained with them, so not to be tuned."""
+"""Rounds of the Sinkhorn iteration; the published weights were trained with them, so not to be tuned."""
 _DROPOUT = nn.Identity
 """In the place of the dropout of training, which is counted in the names of the published entries."""
 
@@ -91,7 +91,7 @@ def _of_patches(width: int, hidden: int, width_out: int) -> nn.Sequential:
 
 
 REDUCTION_SEED = 2025
-"""Of the signed sums; another one makes descriptors that cannot be compared."""
+"""Seed of the signed sums; another one makes descriptors that cannot be compared."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class MegaLocSizes:
     """Sizes of the network; the defaults are those of the published one.
 
     Attributes:
-        width, heads, depth: of the transformer.
+        width, heads, depth: sizes of the transformer.
         hidden: channels within SALAD's perceptrons.
         clusters, cluster_width, token_width: see Salad.
         length: length of the descriptor.

@@ -12,7 +12,7 @@ from .encoder import PATCH_PX, PatchEmbedding
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
-"""Of ImageNet's pixels, red, green, blue; the encoders were trained with them."""
+"""Standard deviation of ImageNet's pixels, red, green, blue; the encoders were trained with them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ class Network(nn.Module, ABC):
             layout: layout of one view.
             mapped: M; points and confidence of all views would be a tenth of the work, so only those used are computed.
             poses: from `conditions`, like the next two; None if nothing is known, or the network is not conditioned.
-            posed: which views have a pose.
+            posed: mask of the views that have a pose.
             metric: whether a pose is in metres; only MapAnything takes it.
         """
 

@@ -27,7 +27,7 @@ class UnsuitableDevice(ValueError):
 
 
 MAX_COMPILED_SHAPES = 64
-"""torch's default, after which it stops compiling, is eight; grids and numbers of views make more."""
+"""Shapes after which torch stops compiling; grids and numbers of views make more than its default of eight."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What operators see of the server: metrics and their port, the log, and traces. Nothing here changes an answer.
+"""The operators' view of the server: metrics and their port, the log, and traces. Nothing here changes an answer.
 
 May import engine, scenes, store, security, method, networks, images and scheduling. Begin with `metrics.Metrics`, which
 has every metric; `logs` formats the log, `otlp` records calls and sends the records to a collector, `event_loop`

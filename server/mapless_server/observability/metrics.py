@@ -64,7 +64,7 @@ COUNTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
         ("queue", "size", "disk", "deleted", "store", "fault"),
     ),
 }
-"""What other rooms count by name: the counter's text, its label, and the label's values."""
+"""Counters that other rooms use by name: the counter's text, its label, and the label's values."""
 
 WAITING = {
     "background_waiting": "References that wait to be matched in the background, as last counted.",
@@ -72,7 +72,7 @@ WAITING = {
     "contradicting_scenes": "Scenes in use whose references do not agree with their poses.",
     "calibration_waiting": "Scenes that changed since they were calibrated, as last counted.",
 }
-"""What they set by name."""
+"""Gauges that other rooms set by name, with their text."""
 
 LOCALIZED = "localized"
 """The outcome of an answer that is a pose."""

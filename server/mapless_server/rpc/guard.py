@@ -107,7 +107,7 @@ class CallGuard:
         self._observer = observer
         self._tracer = tracer
         self.trailers: tuple[tuple[str, str], ...] = ()
-        """Of successful answers, beside `Call.trailers`."""
+        """Trailers of successful answers, beside `Call.trailers`."""
         self._active = 0
         self._idle = asyncio.Event()
         self._idle.set()

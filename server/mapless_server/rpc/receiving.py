@@ -24,7 +24,7 @@ MAX_OPEN_STREAMS = 256
 """Open streams of such methods (health watches, reflection), which have no deadline."""
 
 Context = Any
-"""grpc.aio.ServicerContext, whose annotations are wrong in places."""
+"""A grpc.aio.ServicerContext; its annotations are wrong in places."""
 
 
 class Receiver:

@@ -168,7 +168,7 @@ def to_status(error: RequestError, request_id: str = "") -> status_pb2.Status:
 
 
 PACED_CODES = frozenset({"RESOURCE_EXHAUSTED", "UNAUTHENTICATED", "PERMISSION_DENIED"})
-"""Of what a caller may repeat as fast as it is answered. UNAVAILABLE is not among them, which sends it elsewhere."""
+"""Codes of calls that a caller may repeat as fast as they are answered; after UNAVAILABLE it tries another server."""
 
 PER_S = 50
 """Refusals a second, of all callers together, that are not delayed: 2 % of a core. A server of twenty answers a second

@@ -1,4 +1,4 @@
-"""What the work ahead of queries, in the background, and the look-ups of its results report, for metrics."""
+"""Reports of background work ahead of queries, and of look-ups of its results, for metrics."""
 
 
 class BackgroundObserver:

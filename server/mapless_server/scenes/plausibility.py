@@ -39,14 +39,15 @@ UPRIGHT_BOUND_DEG = 50.0
 """Largest angle to a mean axis: cameras may all be inclined by 45 degrees. Exchanged axes give about 90, a sign 180."""
 
 MAX_RADIUS_M, MIN_RADIUS_M = 10_000.0, 0.01
-"""Of positions about their median. Nobody photographs a scene of 20 km from the ground, and cameras within 1 cm
+"""Radii of positions about their median. Nobody photographs a scene of 20 km from the ground, and cameras within 1 cm
 triangulate nothing beyond a metre; positions in millimetres or degrees do so."""
 
 MAX_ORIGIN_DISTANCE_M = 10_000.0
-"""Of references from a datum's origin; map projections' coordinates are thousands of kilometres away from it."""
+"""Largest distance of references from a datum's origin; map projections' coordinates are thousands of kilometres away
+from it."""
 
 MIN_HEIGHT_M, MAX_HEIGHT_M = -500.0, 10_000.0
-"""Of references above the ellipsoid: from the Dead Sea to above all mountains."""
+"""Heights of references above the ellipsoid: from the Dead Sea to above all mountains."""
 
 DEGREES_SPREAD, DEGREES_SHARE, DEGREES_RATIO = 0.05, 0.01, 100.0
 """Latitudes and longitudes of a scene differ by 5 km at most, and by a hundredth of their own value; heights, in

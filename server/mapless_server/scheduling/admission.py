@@ -1,4 +1,4 @@
-"""Which jobs are admitted, so that no caller can take the room of the others.
+"""Admission of jobs, so that no caller can take the room of the others.
 
 The predicted cost of a job is booked while it is admitted (`Ledger`). A job is refused if it cannot be computed in time
 (`Admission`).

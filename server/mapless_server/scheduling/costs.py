@@ -11,7 +11,7 @@ from .jobs import AnyJob, AnyStep, Flow, Stage
 FIRST_GUESS_S = 0.25
 """Predicted before anything is observed."""
 _EXPECTED = ", if reached"
-"""Of a stage's name, where jobs that did not reach it count."""
+"""Ending of a stage's name, where jobs that did not reach it count."""
 MEMORY = 10
 """About so many of the last jobs of a kind count."""
 MAX_OF_CALLERS = 4000
@@ -19,7 +19,8 @@ MAX_OF_CALLERS = 4000
 MAX_OF_CLIENTS = 100
 """A caller's clients of which predictions are kept, so that one caller does not displace those of others."""
 FORGOTTEN_S = 30.0
-"""What a caller's jobs cost longer ago does not count: as long as it is refused, nothing corrects its prediction."""
+"""Age after which the costs of a caller's jobs do not count: as long as it is refused, nothing corrects its
+prediction."""
 
 
 class CostModel:

@@ -21,7 +21,7 @@ class Flow(NamedTuple):
         tenant: empty for the server's own jobs.
         caller: who cannot be more than one: the name of a token or certificate. Where there is neither, what the client
             calls itself, or its address.
-        client: what a client calls itself among those of a token or certificate, or its address.
+        client: the client's own name among those of a token or certificate, or its address.
     """
 
     tenant: str
@@ -163,7 +163,7 @@ class Next(Generic[PayloadT, ValueT]):
 
     Attributes:
         steps: one of them is computed.
-        fallback: what the job ends with if no step leads to a result in time.
+        fallback: the job's result if no step leads to a result in time.
         is_admitted: whether the job was admitted with these steps, which then wait with those of other jobs.
         has_begun: whether they continue a further step that was computed, and go on though jobs are refused.
     """
@@ -179,7 +179,7 @@ class Next(Generic[PayloadT, ValueT]):
 
 
 StageResult = Next[PayloadT, ValueT] | Done[ValueT] | Exception
-"""What a stage returns for one job."""
+"""The result of a stage for one job."""
 
 
 @dataclass(frozen=True)

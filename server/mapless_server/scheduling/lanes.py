@@ -27,8 +27,8 @@ class Lane:
         long: numbers of the batches that the threads compute of which a step is predicted to take more than a quantum,
             and whether it is one that waited aside.
         low: numbers of the batches that threads of low priority compute.
-        arrivals: of the last jobs that have come to wait, not aside: owner, predicted time with later stages, time of
-            arrival.
+        arrivals: for each of the last jobs that have come to wait, not aside: owner, predicted time with later stages,
+            time of arrival.
     """
 
     threads: int

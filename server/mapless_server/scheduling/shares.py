@@ -22,7 +22,7 @@ class _Member:
         number: the order in which members of a group got jobs, of those with the same time.
         jobs: number of its jobs.
         least_s: the largest so far of the least `served_s` of its active members.
-        equal_s: what an active member would have been given with equal shares, within what they have been given.
+        equal_s: time that an active member would have been given with equal shares, within what they have been given.
         active: its members that have jobs.
         idle: its last members that have none.
     """

@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 _CURVES = ("secp256r1", "secp384r1")
 _LEAST_RSA_BITS, _USUAL_RSA_BITS = 1024, 2048
-"""gRPC's TLS takes 1024 bits, OpenSSL with its usual level of security 2048 and more."""
+"""Least bits of an RSA key: gRPC's TLS takes 1024, OpenSSL with its usual level of security 2048."""
 _USABLE = "make a key on the curve P-256 (openssl ecparam -name prime256v1 -genkey) or of RSA with 2048 bits or more"
 
 

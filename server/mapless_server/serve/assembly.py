@@ -74,7 +74,7 @@ WITH_WEIGHTS = frozenset(entry.name for entry in CATALOGUE)
 
 
 _Missing = dict[str, ImportError | WeightsMissing]
-"""What `auto` would use, and why it cannot, by the names of the weights."""
+"""Features that `auto` would use, by the names of their weights, and why it cannot."""
 
 
 class StartupError(Exception):

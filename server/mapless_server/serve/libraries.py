@@ -1,4 +1,4 @@
-"""What libraries must have before they are imported and before threads are started; commands set it first."""
+"""Settings that libraries need before they are imported and threads are started; commands make them first."""
 
 import ctypes
 import os

@@ -152,7 +152,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         return response
 
     async def _debug_of(self, request: pb.LocalizeRequest, query: Query, answer: Answer) -> pb.Debug | None:
-        """What the pose rests on, if the caller or a watcher of the scene wants it, and there is any."""
+        """The evidence behind the pose, if the caller or a watcher of the scene wants it, and there is any."""
         is_wanted = request.options.include_debug or query.scene_key in self._watchers.by_scene
         if answer.support is None or not is_wanted:
             return None

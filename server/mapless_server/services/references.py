@@ -58,7 +58,7 @@ MAX_RETRIEVED = 1000
 DEFAULT_AUDITS, MAX_AUDITS = 10, 100
 MAX_NOTED = 10  # names in a line of the log
 MAX_COMPARED = 1000  # references, the first by id, with which a change of the scene is compared
-MAX_COMPARED_ADDED = 100  # the same, with which references are compared that are added: a millisecond beside hundreds
+MAX_COMPARED_ADDED = 100  # stored ones that new ones are compared with: 1 ms, where adding takes hundreds
 STORE_THREADS = 4  # writers share one lock; the other threads keep readers from waiting for it
 
 T = TypeVar("T")

@@ -17,7 +17,7 @@ from mapless_server.errors import FailedPrecondition, Overloaded, Unavailable
 from mapless_server.security import SceneKey, tenant_of
 
 MAX_WATCHERS = 8
-"""Of all scenes together: each may have `QUEUE_LENGTH` photographs in memory."""
+"""Largest number for all scenes together: each may have `QUEUE_LENGTH` photographs in memory."""
 MAX_WATCHERS_OF_TENANT = 4
 """So that one tenant cannot use up the limit of all."""
 QUEUE_LENGTH = 3

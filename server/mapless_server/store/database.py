@@ -1,4 +1,4 @@
-"""What the store's databases have in common: SQLite in a folder, or a PostgreSQL that several servers share.
+"""The common parts of the store's databases: SQLite in a folder, or a PostgreSQL that several servers share.
 
 Faults of the databases become errors that a caller can act on; all others become INTERNAL. `sqlite` and `postgresql`
 convert their own.

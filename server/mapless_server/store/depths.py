@@ -18,7 +18,8 @@ from .database import Database
 from .tables import reference, reference_depth, reference_matching
 
 DEPTH_VERSION = 1
-"""Of how depths are made, checked and encoded; to be raised by every change that makes those that are kept wrong."""
+"""Version of the way depths are made, checked and encoded; to be raised by every change that makes those that are kept
+wrong."""
 
 _OF_VERSION = f"depth-{DEPTH_VERSION}/"
 

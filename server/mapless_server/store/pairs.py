@@ -49,7 +49,7 @@ Pair = tuple[str, str]
 
 @dataclass(eq=False)
 class Progress:
-    """What a server knows of the claims of one matching, so that it reads only what has changed.
+    """A server's knowledge of the claims of one matching, so that it reads only what has changed.
 
     Attributes:
         generations: by scene, the generation up to which every reference has been claimed.

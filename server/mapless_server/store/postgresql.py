@@ -26,7 +26,7 @@ from .tables import SCHEMA_VERSION, store_version
 DRIVER = "postgresql+psycopg"
 CONNECTIONS_KEPT = 4
 CONNECTIONS_AT_MOST = 16
-"""Of one server: by default PostgreSQL accepts 100, which are six servers."""
+"""Connections of one server: by default PostgreSQL accepts 100, which are six servers."""
 CONNECTION_WAIT_S = 5.0
 """For a free connection of this server's own; less than callers wait."""
 

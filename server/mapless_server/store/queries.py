@@ -127,7 +127,7 @@ def forget_removals(connection: Connection, scene_key: SceneKey, until_generatio
 
 
 def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str] | None) -> dict[str, str]:
-    """Keys, by id, of those of these references that exist; of all, ordered by id, for None."""
+    """Maps ids of existing references to keys. None: all references of the scene, ordered by id."""
     column = reference.c
     statement = select(column.reference_id, column.key).where(column.scene_id == scene_key)
     parts = [statement.order_by(column.reference_id)]

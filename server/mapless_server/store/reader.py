@@ -249,7 +249,7 @@ class StoreReader:
 
     @observed
     def find_keys(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, str]:
-        """Keys, by id, of those of these references that exist, including damaged ones.
+        """Maps ids of existing references to keys, including those of damaged ones.
 
         NotFound if there is no such scene.
         """

@@ -32,7 +32,7 @@ CALIBRATION_MODEL = 4
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """What the references of a scene, some of them localized against the others, show about its answers.
+    """Radii and trust of a scene's answers, learned from references that are localized against the others.
 
     Attributes:
         kind: kind of the answers that it holds for, see `calibration_kind`.
@@ -237,7 +237,7 @@ class IndexedReference:
 
 @dataclass(frozen=True, eq=False)
 class SceneChanges:
-    """What has changed in a scene since a generation, read at one moment.
+    """The changes of a scene since a generation, read at one moment.
 
     Attributes:
         generation: generation of the scene at that moment, for the next request.

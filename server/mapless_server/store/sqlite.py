@@ -41,7 +41,7 @@ FREE_SPACE_TIMEOUT_MS = 100
 JOURNAL_KEPT_BYTES = 8 * 2**20
 """A journal that a large change has made longer is truncated when it is restarted. Deleting needs less."""
 SPACE_TO_OPEN_BYTES = 64 * 1024
-"""What SQLite needs beside the file to open it."""
+"""Free space that SQLite needs beside the file to open it."""
 
 _URI_PREFIX = "file:"
 _BEGIN_OPTION = "sqlite_begin_statement"

@@ -7,7 +7,7 @@ the package `rosbags`. Begin with `source`.
 from pathlib import Path
 
 SUFFIXES = (".mcap", ".db3")
-"""Of the files of a recording."""
+"""Suffixes of the files of a recording."""
 
 
 def is_recording(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Which parts of a recording are used. Imports what it needs when it runs, so that --help answers at once."""
+"""The parts of a recording that are used. Imports what it needs when it runs, so that --help answers at once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BagOptions:
-    """Which topics and frames of a recording are used; empty for unambiguous ones. Each field is a flag.
+    """The topics and frames of a recording that are used; empty for unambiguous ones. Each field is a flag.
 
     Poses of /tf are in `world_frame`, by default the root of its tree. `body_frame` is the frame whose poses a topic
     without child_frame_id has, by default the root of the camera's static frames. `rectified` says whether P of

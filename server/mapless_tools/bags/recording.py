@@ -23,7 +23,7 @@ _HINTS = (
     ("end magic", ": it is truncated; `mcap recover` saves what can be read"),
     ("Profile is not ros2", ": only recordings of ROS 2 are read"),
 )
-"""What to say after a message of the library that has a text."""
+"""Explanations that follow a message of the library, by a text in it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,7 @@ class FrameTree:
         return found
 
     def lookup(self, target: str, source: str, time_s: float) -> RigidTransform:
-        """target_from_source at a time; LookupError if no frames connect them, ValueError without a pose then."""
+        """Gives target_from_source at a time; LookupError if no frames connect them, ValueError without a pose then."""
         ancestors = self.lineage(target)
         common = next((it for it in self.lineage(source) if it in ancestors), None)
         if common is None:

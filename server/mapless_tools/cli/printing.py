@@ -1,4 +1,4 @@
-"""What commands print: text on a terminal, else JSON; flags decide otherwise."""
+"""The output of commands: text on a terminal, else JSON; flags decide otherwise."""
 
 import json
 import sys

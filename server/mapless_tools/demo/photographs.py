@@ -16,7 +16,7 @@ from mapless_tools.ingest.formats.cameras import read_folder
 
 ROOM = Path(__file__).with_name("room")
 MAX_FRAMES = 60
-"""Of a longer real sequence so many frames are used, evenly spread: enough to judge, in a minute."""
+"""Frames that are used of a longer real sequence, evenly spread: enough to judge, in a minute."""
 QUERY_EVERY = 3
 
 

@@ -23,7 +23,7 @@ DRAWN_PX = 960
 """Longer side of the photographs that are drawn."""
 MAX_MEDIAN_ERROR_M = 0.03
 MAX_MEDIAN_ERROR_DEG = 1.0
-"""What the rendered room must reach for the demo to succeed."""
+"""Largest median error in the rendered room for the demo to succeed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -102,7 +102,7 @@ _MARKS = {
 }
 
 LAYOUTS = ("auto", *BENCHMARKS, "cameras")
-"""What `--layout` takes."""
+"""Values of `--layout`."""
 
 
 @dataclass(frozen=True)

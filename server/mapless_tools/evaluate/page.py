@@ -77,7 +77,7 @@ def facts(suite: Suite) -> dict[str, str]:
 
 
 def problems(suite: Suite) -> list[str]:
-    """What is missing, and choices that were made, a sentence each."""
+    """Missing parts, and choices that were made, a sentence each."""
     lines = [f"{failure.scene} is not complete: {failure.message}" for failure in suite.failures]
     for scene in suite.scenes:
         refused = scene.dataset.refused
@@ -115,9 +115,9 @@ def _subsampled(suite: Suite) -> list[str]:
 
 
 RIVALS = ("ACE", "ACE + GS-CPR", "L3")
-"""Of the paper's figure of sparsity."""
+"""Methods in the paper's figure of sparsity."""
 MAX_POINTS = 400
-"""Of a curve along a sequence; beyond, each point is the worst of several queries."""
+"""Most points of a curve along a sequence; beyond, each point is the worst of several queries."""
 
 
 @dataclass(frozen=True)

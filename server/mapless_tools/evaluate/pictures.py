@@ -99,7 +99,7 @@ def worst_of(run: Run, count: int, matcher: Matcher) -> list[WorstQuery]:
 def fit_true_poses(
     query: Frame, reference: Frame, query_view: View, reference_view: View, matches: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
-    """Which matches (M, 2) of query and reference keypoints are within `EPIPOLAR_PX` of the true epipolar line."""
+    """Mask (M,) of the matches (M, 2) of query and reference within `EPIPOLAR_PX` of the true epipolar line."""
     query_from_reference = query.world_from_camera.inverse().compose(reference.world_from_camera)
     essential = cross_matrix(query_from_reference.translation) @ query_from_reference.rotation
     x_query = query_view.camera.rays(query_view.features.keypoints[matches[:, 0]])

@@ -20,7 +20,7 @@ from .benchmarks import DENSE, LAYOUTS, ScenePlace
 T = TypeVar("T")
 
 MAX_K = 64
-"""What one call of Localize takes."""
+"""Most references that one call of Localize takes."""
 QUERY_MARGIN = 3
 """Queries beside references keep this far from the first and the last frame, so that they lie within the walk."""
 DEFAULT_QUERY_COUNT = 40

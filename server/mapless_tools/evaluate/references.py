@@ -43,7 +43,7 @@ class Matcher:
 
     @classmethod
     def of(cls, settings: Settings) -> "Matcher":
-        """Of the first features that a server with these settings has; UsageError if it has none."""
+        """Describes the first features that a server with these settings has; UsageError if it has none."""
         try:
             features, extractor = make_first_features(settings)
         except (ValueError, ImportError, WeightsError) as error:

@@ -21,7 +21,7 @@ class Rung:
         rung: its name.
         tried: photographs on which it was made, once or more often.
         answered: photographs whose answer came from it, rejections included.
-        rescued: of these the ones that are localized right although no earlier attempt's pose was accepted.
+        rescued: those of them that are localized right although no earlier attempt's pose was accepted.
         wrong: photographs that are localized wrongly since this attempt: the answer before it was right, or none.
         processor_s: processor time of all its attempts, seconds.
     """

@@ -143,7 +143,7 @@ class Suite:
 
 @dataclass(frozen=True)
 class RunSetup:
-    """What all runs have in common."""
+    """The common parts of all runs."""
 
     options: SuiteOptions
     matcher: Matcher
@@ -254,7 +254,7 @@ def _runs_of(scene: SceneWork, setup: RunSetup) -> list[Run]:
 
 
 def _identity(scene: SceneWork, setup: RunSetup) -> dict[str, Any]:
-    """What results depend on besides the data, without the number of queries, so that more can be added."""
+    """All that results depend on besides the data, without the number of queries, so that more can be added."""
     made, options = setup.provenance, setup.options
     pairs = None
     if scene.pairs is not None:

@@ -35,7 +35,7 @@ _SENT_HEADERS = (
     "x-request-id",
     "x-user-agent",
 )
-"""What browsers may send besides what they may always."""
+"""Headers that browsers may send besides those that they always may."""
 _READ_HEADERS = ("grpc-message", "grpc-status", "grpc-status-details-bin", "retry-after", "x-request-id")
 _PREFLIGHT_S = 7200
 T = TypeVar("T")
@@ -43,7 +43,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class GatewayOptions:
-    """What is served, and to whom: the scene of requests that name none, if any, and a folder of pages for "/"."""
+    """Options of the gateway: the scene of requests that name none, if any, and a folder of pages for "/"."""
 
     scene: str = ""
     pages: Path | None = None

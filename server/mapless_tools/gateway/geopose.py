@@ -36,12 +36,12 @@ _TURN_DEG_PER_S = 90.0
 _OLD_S = 60.0
 """Older priors say nothing that a photograph does not."""
 _UNKNOWN_SIGMA_M = 50.0
-"""Of a position without an accuracy: that of a receiver among houses."""
+"""Standard deviation of a position without an accuracy: that of a receiver among houses."""
 _SIGMAS_OF_68 = 1.5
 """A 68 % radius in the plane, in standard deviations."""
 _MAX_SIGMA_M = 1e4
 _HEIGHTS_M = (-12_000, 100_000)
-"""Of the interface's positions."""
+"""Range of heights of the interface's positions."""
 _UNKNOWN_MODEL = "UNKNOWN"
 
 

@@ -96,7 +96,8 @@ def of_server(error: MaplessError, field: str | None = None) -> Failure:
 
 
 MAX_VALUES = 100_000
-"""Of a JSON text, whose objects take ten times its memory and seconds to make; requests of devices have hundreds."""
+"""Most values of a JSON text, whose objects take ten times its memory and seconds to make; requests of devices have
+hundreds."""
 _LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 
 
@@ -108,7 +109,8 @@ class GuardOptions:
         origins: origins of pages that may call, besides the gateway's own, "https://app.example"; ("*",) for all.
         is_loopback: whether it listens on this machine only. Then host names other than its own and those of `origins`
             are rejected: a page whose name resolves to this machine would count as the gateway's own.
-        max_body_bytes: of a request. A photograph of 16 MiB, the largest that servers accept, has 22.4 MB in base64.
+        max_body_bytes: largest body of a request. A photograph of 16 MiB, the largest that servers accept, has 22.4 MB
+            in base64.
         max_requests: largest number of concurrent requests; further ones are rejected.
         max_held_bytes: largest size of all concurrent requests. It limits the memory, which is four times as much:
             text, photograph, call, and the bytes being sent.

@@ -12,14 +12,14 @@ from mapless_tools.dataset import Dataset, Frame
 
 SAME_POSITION_M = 1e-3
 SAME_ROTATION_DEG = 0.01
-"""Of one photograph no pose is known better: it is stored, and travels, rounded, and two equal frames of a video that
+"""Poses of one photograph this close are equal: they are stored and sent rounded, and two equal frames of a video that
 stands still were posed one by one."""
 _SAME_SHARE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What identifies a reference."""
+    """The identity of a reference."""
 
     reference_id: str
     image_sha256: str
@@ -62,7 +62,7 @@ class KnownReferences:
 
 
 def stored_of(reference: Reference) -> Stored:
-    """What identifies a reference of the server."""
+    """The identity of a reference of the server."""
     return Stored(
         reference.reference_id,
         reference.image_sha256,

@@ -33,7 +33,7 @@ POINT_SOURCES = 40
 """References that are localized among the others for the points that they share; each takes as long as a query."""
 _LINE_COLOUR = [0.2, 0.5, 1.0, 1.0]
 _GAMMA = 2.2
-"""Of photographs; colours of points are linear in glTF."""
+"""Gamma of photographs; colours of points are linear in glTF."""
 _UNLIT = "KHR_materials_unlit"
 
 

@@ -32,7 +32,7 @@ LINE_SHARE, LINE_RESIDUALS = 0.01, 3.0
 """Positions are collinear if they are nearer to a line than 1 % of their extent along it, or than three times their
 residual: the rotation about the line is then that of the noise."""
 PLACE_SHARE = 1e-6
-"""Of a model's extent: cameras closer than this are at one place, but for rounding."""
+"""Share of a model's extent: cameras closer than this are at one place, but for rounding."""
 
 
 @dataclass(frozen=True)

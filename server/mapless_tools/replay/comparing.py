@@ -23,7 +23,7 @@ DESCRIBE = "describe"
 ABSENT = "-"
 
 MAX_CHANGES = 40
-"""Of one answer; `Debug` alone has thousands of numbers."""
+"""Most changes shown of one answer; `Debug` alone has thousands of numbers."""
 
 
 @dataclass(frozen=True)

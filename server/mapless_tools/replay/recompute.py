@@ -207,7 +207,7 @@ MESSAGES: dict[str, tuple[Any, Any]] = {
     "LocalizeRig": (pb.LocalizeRigRequest, pb.LocalizeRigResponse),
     "LocalizeSequence": (pb.LocalizeSequenceRequest, pb.LocalizeSequenceResponse),
 }
-"""Of each method that is captured."""
+"""Request and response of each method that is captured."""
 
 
 def response_of(call: CapturedCall) -> Response:

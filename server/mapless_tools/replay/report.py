@@ -23,7 +23,7 @@ IDENTICAL, CHANGED, NOT_COMPUTED = "identical", "changed", "not computed"
 
 @dataclass(frozen=True)
 class Selection:
-    """Which calls: of these ids, the latest ones, of a tenant, in a scene; empty values and None select all."""
+    """A choice of calls: of these ids, the latest ones, of a tenant, in a scene; empty values and None select all."""
 
     request_ids: frozenset[str] = frozenset()
     last: int | None = None

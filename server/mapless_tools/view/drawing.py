@@ -66,9 +66,10 @@ REFERENCE, OTHER, QUERY, SELECTED, DOUBT = (
     (255, 190, 60),
     (230, 90, 40),
 )
-"""Of references, of those drawn as dots, of queries, of the selected one, and of poses that contradict each other."""
+"""Colours of references, of those drawn as dots, of queries, of the selected one, and of poses that contradict each
+other."""
 INLIER, OUTLIER = (46, 230, 166), (255, 107, 43)
-"""Of matches that agree with the pose, and of those that do not."""
+"""Colours of matches that agree with the pose, and of those that do not."""
 MAX_RAYS = 90
 """Lines from a query to its points; more hide what they lead to."""
 

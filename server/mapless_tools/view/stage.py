@@ -27,14 +27,14 @@ MAX_POINTS = 150_000
 REFERENCE_PX = 1200
 """Longer side of a reference's photograph in its dialogue, at most."""
 _QUERY_SIZE = 1.5
-"""Of a query's frustum beside those of references."""
+"""Size of a query's frustum, relative to those of references."""
 _VOXEL_SHARE, _POINT_SHARE = 0.002, 0.004
-"""Of the scene's extent: points nearer than this to one another are shown as one; and how large one is."""
+"""Shares of the scene's extent: points nearer than this to one another are shown as one; and how large one is."""
 _FOUND, _LOST = (72, 84, 96), (178, 84, 36)
-"""Of the buttons of queries."""
+"""Colours of the buttons of queries."""
 _NONE_YET = "None yet. They appear here as the server answers them."
 _WIDE = "<style>.mantine-Modal-content { flex: 0 0 min(1000px, 94vw) !important; }</style>"
-"""viser's dialogues are narrow, and photographs are not."""
+"""Style for dialogues as wide as photographs; viser's are narrow."""
 
 
 @dataclass(eq=False)

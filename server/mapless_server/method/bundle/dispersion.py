@@ -99,7 +99,7 @@ LEAST_EIGENVALUE = 1e-7
 """Least eigenvalue of the pose's information with unit diagonal: below, the pose is not determined."""
 
 LEAST_VARIANCE = 1e-12
-"""Of S, as a share of I / w, where its point has no other observation but rounding."""
+"""Least variance in S, as a share of I / w, where its point has no other observation but rounding."""
 
 LEAST_LEFT = 0.01
 """Share of the pose's information added to what is left without a reference, which may not determine a pose."""
@@ -117,7 +117,7 @@ class Dispersion:
         regions: (G, 6) influence of the matches in each region of the photograph.
         offset: (6,) the Gauss-Newton step from the pose to the optimum.
         gap: distance to the nearest reference that holds the pose, over the median depth of the points.
-        intrinsics: what the data say of errors of the intrinsics; empty if the problem has not these unknowns.
+        intrinsics: evidence of the data about errors of the intrinsics; empty if the problem has not these unknowns.
     """
 
     references: Array

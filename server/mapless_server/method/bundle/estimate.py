@@ -48,8 +48,8 @@ class PoseEstimate:
         is_adjusted: whether the pose is that of the adjustment. The covariance of another is from the residuals alone
             and leaves out correlated errors (see `adjust.with_covariance`).
         without_priors: the estimate before priors were used; None if none was used.
-        intrinsics: what the matches with points say of errors of the photograph's intrinsics, which the covariance of
-            an adjusted pose contains; None without an adjustment.
+        intrinsics: evidence of the matches with points about errors of the photograph's intrinsics, which the
+            covariance of an adjusted pose contains; None without an adjustment.
         view: the photograph's view with the intrinsics of the estimate, if it contradicts the given ones; else None.
     """
 

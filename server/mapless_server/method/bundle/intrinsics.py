@@ -30,7 +30,7 @@ from .priors import IntrinsicsSigma
 from .significance import HEAVY_TAIL, least_sigmas
 
 PRINCIPAL = (1, 2)
-"""Which of the four errors are those of the principal point."""
+"""Indices of the principal point among the four errors."""
 
 OTHER_CAMERA_SIGMAS = 3.0
 """A photograph whose focal length or principal point is off by more, of standard deviations of an error that it alone
@@ -91,7 +91,7 @@ class IntrinsicsEquations:
         Args:
             removed: (4,) errors that are removed from the intrinsics at which the equations are linearized.
             information: (..., 4) inverse variances of the errors without the photograph.
-            inflation: of standard deviations that follow from residuals; weighs the data against the prior.
+            inflation: factor of standard deviations that follow from residuals; weighs the data against the prior.
             region_factor: see `UncertaintyOptions`.
 
         Raises:
@@ -113,7 +113,7 @@ class IntrinsicsEquations:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsEvidence:
-    """What a photograph's matches say about the errors of its intrinsics: true minus given, for s, x, y and k1.
+    """Evidence of a photograph's matches about the errors of its intrinsics: true minus given, for s, x, y and k1.
 
     Attributes:
         given: the camera, in pixels of the processed image, with its distortion.
@@ -139,11 +139,11 @@ class IntrinsicsEvidence:
 
     @property
     def pose_covariance(self) -> Array:
-        """What these errors add to the covariance (6, 6) of a pose that was computed without them."""
+        """The part of these errors in the covariance (6, 6) of a pose that was computed without them."""
         return np.asarray(self.motion @ self.covariance @ self.motion.T)
 
     def contradicted(self, options: ContradictionOptions, prior_sigma: Array | None = None) -> NDArray[np.bool_]:
-        """Which parameters (4,) are significantly wrong.
+        """Whether each parameter (4,) is significantly wrong.
 
         `prior_sigma` (4,): standard deviations of the given values; by default those of the request, unless they are
         wider than the usual ones: the photograph is then more accurate.

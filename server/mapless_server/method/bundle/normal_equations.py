@@ -280,7 +280,7 @@ class NormalEquations:
 
 @dataclass(frozen=True, eq=False)
 class EliminatedPoints:
-    """What is needed to compute the points once the cameras are known.
+    """The data needed to compute the points once the cameras are known.
 
     Attributes:
         factor: L (6, P), as in `optimize.SYMMETRIC`.

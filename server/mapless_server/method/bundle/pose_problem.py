@@ -125,14 +125,14 @@ class AdjustOptions:
 
 @dataclass(frozen=True, eq=False)
 class AdjustInput:
-    """What a pose is adjusted to.
+    """The data that a pose is adjusted to.
 
     Attributes:
         query: the query.
         references: the references, in the order of the structure's tracks.
         structure: metric points.
         matches: 2D-3D matches of the query with these points.
-        options: of the adjustment.
+        options: options of the adjustment.
         intrinsics: standard deviations of the query's intrinsics; None for the defaults.
         query_matches: matches of the query with each reference; where many belong to no point, they are used too.
     """
@@ -169,7 +169,7 @@ class Solved:
     """The solution of a query's adjustment.
 
     Attributes:
-        given: what the pose was adjusted to.
+        given: the data that the pose was adjusted to.
         problem: the problem, without priors on the pose or with them.
         there: values of its unknowns, at its optimum or near it.
         used: indices of the matches that it uses.

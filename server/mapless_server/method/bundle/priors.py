@@ -55,10 +55,10 @@ class IntrinsicsSigma:
     """Standard deviations of a photograph's intrinsics.
 
     Attributes:
-        focal_share: of both focal lengths together, as a share of them. Lenses change by this much with focus and
-            temperature, and calibrations are not more repeatable.
-        principal_share: of each coordinate of the principal point, as a share of the image's width.
-        k1: of the first radial coefficient.
+        focal_share: standard deviation of both focal lengths together, as a share of them. Lenses change by this much
+            with focus and temperature, and calibrations are not more repeatable.
+        principal_share: standard deviation of each coordinate of the principal point, as a share of the image's width.
+        k1: standard deviation of the first radial coefficient.
     """
 
     focal_share: float = 0.003

@@ -184,7 +184,7 @@ class Layout:
 
     @cached_property
     def shown(self) -> NDArray[np.bool_] | None:
-        """Which pixels (H, W) of the picture show the photograph; None if all do."""
+        """Mask (H, W) of the picture's pixels that show the photograph; None if all do."""
         left, top, width, height = self.box
         shown = np.zeros((self.grid.height_px, self.grid.width_px), bool)
         box = shown[top : top + height, left : left + width]

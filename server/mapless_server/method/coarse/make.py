@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 COMPILED_ASPECTS = ((4, 3), (3, 4))
-"""Of most cameras, landscape and portrait."""
+"""Aspects of most cameras, landscape and portrait."""
 
 
 def make_reconstructor(

@@ -43,7 +43,7 @@ class NetworkOptions:
 
     Attributes:
         pixel_limit: largest number of pixels of a picture.
-        cache: of references' tokens.
+        cache: tokens of references.
         query_rays: whether a network that takes intrinsics gets the query's. MapAnything saw few views without a pose
             among posed ones when it was trained, with intrinsics or without: not measured.
     """

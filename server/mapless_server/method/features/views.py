@@ -306,7 +306,7 @@ MAX_INCIDENCE_DEG = 80.0
 """Rays further from the optical axis are dropped: a pinhole's pixels run to infinity towards 90 degrees."""
 
 MAX_ITERATIONS = 50
-"""Of undistortion."""
+"""Largest number of iterations of the undistortion."""
 
 
 def undistort_pixels(pixels: Array, camera: Camera) -> Array:

@@ -80,7 +80,7 @@ class Chain:
         frames: indices of the photographs, in order.
         jumps: the jumps between successive ones of them.
         scale: metres per unit of the session; the chain's own estimate where it was unknown.
-        cost: of the pairs, the jumps and the poses that are left out.
+        cost: sum for the pairs, the jumps and the poses that are left out.
         is_certain: whether the jumps are the same in any unit that the session may have.
     """
 

@@ -28,7 +28,7 @@ ADJUST = AdjustOptions()
 """Options as for one photograph."""
 
 MAX_MATCHES = 300
-"""Of a photograph, evenly thinned; several photographs have enough together."""
+"""Largest number of matches of a photograph, evenly thinned; several photographs have enough together."""
 
 
 class GroupState(Protocol):

@@ -28,8 +28,8 @@ class Localization:
         prior_checks: comparison of the pose with each prior.
         trust: 0 to 1, share of right answers whose score is at most as high (see `judge`); None for a pose without
             refinement.
-        scale_source: what its lengths rest on.
-        intrinsics_checks: what the matches say of each parameter of the intrinsics; empty for a pose without an
+        scale_source: the basis of its lengths.
+        intrinsics_checks: evidence of the matches about each parameter of the intrinsics; empty for a pose without an
             adjustment.
     """
 

@@ -241,9 +241,9 @@ class Comparison:
 
     Attributes:
         gain: ratio of their scores.
-        sigmas, tested: what the other gains, keypoint by keypoint, in standard deviations; and how many were compared.
+        sigmas, tested: gain of the other, keypoint by keypoint, in standard deviations; number of cameras compared.
         checks: the parameters in which the two differ, in conflict.
-        lens: of the given camera.
+        lens: lens of the given camera.
     """
 
     gain: float
@@ -374,7 +374,7 @@ def _k1_step(camera: Camera, steps: _Steps) -> float:
 
 
 def _bend(camera: Camera) -> float:
-    """What r^3 is multiplied by in the distance at which the lens shows a ray of slope r."""
+    """The factor of r^3 in the distance at which the lens shows a ray of slope r."""
     return 0.0 if camera.distortion is None else camera.distortion.cubic
 
 

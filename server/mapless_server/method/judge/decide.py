@@ -101,7 +101,7 @@ def decide(found: Sequence[Found], priors: Priors, unit: str = "m", options: Pla
     Args:
         found: the attempts' results, in order; poses beyond the caller's limits are rejections that say so.
         priors: the photograph's priors, in the caller's world.
-        unit: of the scene's lengths, in messages.
+        unit: unit of the scene's lengths, in messages.
         options: when poses are of one place.
     """
     failed = [it for it in found if isinstance(it, Failed)]

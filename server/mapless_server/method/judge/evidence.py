@@ -123,7 +123,7 @@ def disagreement_of_references(support: PosedSupport, votes: Votes, distance_m: 
 
 
 def half_of_references(counts: NDArray[np.intp], random: np.random.Generator) -> NDArray[np.bool_]:
-    """Which references are in the first half, that both have about as many of their numbers of matches (K,)."""
+    """Mask (K,) of the first half of the references, so that both halves have about as many matches (K,)."""
     order = np.argsort(-counts * (1 + SHUFFLING * random.random(len(counts))), kind="stable")
     in_first, totals = np.zeros(len(counts), bool), [0, 0]
     for reference in order:
@@ -312,7 +312,7 @@ def epipolar_share(
 
 
 def _inside(views: Sequence[View], world_from_camera: Sequence[RigidTransform], x_in_world: Array) -> NDArray[np.bool_]:
-    """Which of the points (P, 3) project into each of V photographs, (V, P)."""
+    """Mask (V, P) of the points (P, 3) that project into each of V photographs."""
     poses = [it.inverse() for it in world_from_camera]
     rotations, translations = np.stack([it.rotation for it in poses]), np.stack([it.translation for it in poses])
     x, y, z = np.moveaxis(rotations @ x_in_world.T + translations[:, :, None], 1, 0)

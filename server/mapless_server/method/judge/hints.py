@@ -72,7 +72,7 @@ def hinted(
     """Adds a hint to a rejection without one.
 
     Args:
-        answer: of the photograph, with the matches behind it.
+        answer: answer to the photograph, with the matches behind it.
         query: the photograph.
         references: its references, in order.
         has_prior: whether the request has one on position or heading.

@@ -56,9 +56,9 @@ class Attempt:
         features: index of the features, the cheapest first.
         raster: where they are found in the photograph.
         angles_deg: by how much the raster is turned clockwise; several if references are rolled against one another.
-        where: which references are used.
+        where: the references that are used.
         matching: how the photographs are matched.
-        solver: which matches give the pose.
+        solver: the matches that give the pose.
     """
 
     features: int = 0
@@ -128,7 +128,7 @@ class Hypothesis:
     Attributes:
         attempt: how it was found.
         answer: its outcome is the accepted pose, or the rejection that says why it is not.
-        doubts: what it leaves in doubt.
+        doubts: the doubts that it leaves.
         world_from_camera: the pose in the caller's world, metric.
         covariance: (6, 6) as of `Localization`, without what halves of the data that disagree add to it; zeros for a
             pose that nothing has checked.

@@ -38,7 +38,7 @@ class ReferencesWithoutFixed:
 
     Attributes:
         ignored: parts of the images; false if nothing is fixed.
-        of_reference: which keypoints (N,) are ignored, by the reference's key.
+        of_reference: mask (N,) of the ignored keypoints, by the reference's key.
         pairs: the agreeing matches of pairs without ignored keypoints, by the keys of both references.
     """
 
@@ -344,10 +344,10 @@ def make_matcher(
     Args:
         features: one of `OPTIONS`.
         threads: number of threads that a query's pairs are distributed over.
-        weights: of the features' LightGlue; None takes nearest neighbours alone. On a CUDA device LightGlue matches the
-            query; on a CPU, where it is slow, it is the `Matcher.pair_matching`.
+        weights: weights of the features' LightGlue; None takes nearest neighbours alone. On a CUDA device LightGlue
+            matches the query; on a CPU, where it is slow, it is the `Matcher.pair_matching`.
         device: "cpu" or a CUDA device, for LightGlue.
-        arithmetic: of nearest neighbours.
+        arithmetic: arithmetic of nearest neighbours.
 
     Raises:
         ValueError: unknown name, or features without a LightGlue.

@@ -139,7 +139,7 @@ class ReferencePairs:
         options: options of matching.
         pair_matching: makes the strong matches; None if nothing does.
         stationary: options of finding what is fixed to the cameras.
-        arithmetic: of nearest neighbours.
+        arithmetic: arithmetic of nearest neighbours.
         stored: where pairs that are not cached are looked up; None looks up none.
     """
 

@@ -37,7 +37,7 @@ class CameraMatches:
     rig_from_camera: RigidTransform
 
     def inliers(self, world_from_rig: RigidTransform | Similarity, inlier_px: float) -> NDArray[np.bool_]:
-        """Which of the matches (M,) are inliers of a pose."""
+        """Mask (M,) of the matches that are inliers of a pose."""
         return self.seen.errors_px(camera_in_world(world_from_rig, self.rig_from_camera)) < inlier_px
 
     def __len__(self) -> int:

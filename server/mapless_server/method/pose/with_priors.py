@@ -39,7 +39,7 @@ LOSS_SCALE_PX = 1.4
 """Scale c of the Cauchy loss; a right match has a standard deviation of one pixel."""
 
 PRIOR_WEIGHT = 4.0
-"""w, factor by which the matches have less information than if their errors were independent: the square of
+"""The factor w by which the matches have less information than if their errors were independent: the square of
 `AdjustOptions.error_inflation`."""
 
 STEPS = MinimizeOptions(iterations=10, min_decrease=1e-4)
@@ -58,7 +58,8 @@ WEAK_INFORMATION = np.diag([1e-6] * 3 + [1e-2] * 3)
 """Information of an unknown pose: within kilometres, of any orientation."""
 
 MAX_MATCHES = 300
-"""Of RANSAC with gravity, evenly thinned; more do not improve the choice, and scoring is linear in them."""
+"""Largest number for RANSAC with gravity, evenly thinned; more do not improve the choice, and scoring is linear in
+them."""
 
 BATCH, MAX_SAMPLES, CONFIDENCE = 64, 512, 0.999
 """Samples that are scored together, and at most; and the probability that two right matches have been drawn with which

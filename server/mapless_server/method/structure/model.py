@@ -29,7 +29,7 @@ class ScaleStage(str, Enum):
 
 
 class ScaleSource(str, Enum):
-    """What the lengths of an answer rest on."""
+    """The basis of an answer's lengths."""
 
     REFERENCES = "references"
     """The references' given poses."""
@@ -61,7 +61,7 @@ class MetricScale:
 
     @property
     def source(self) -> ScaleSource:
-        """What the scale rests on."""
+        """The basis of the scale."""
         return ScaleSource.NETWORK if self.stage is ScaleStage.NETWORK else ScaleSource.REFERENCES
 
 
@@ -120,7 +120,7 @@ class Structure:
 
     @property
     def triangulated(self) -> NDArray[np.bool_]:
-        """Which points (P,) several references observe."""
+        """Mask (P,) of the points that several references observe."""
         if self.planes is None:
             return np.ones(len(self.x_in_world), bool)
         return np.bincount(self.tracks.point, minlength=len(self.x_in_world)) > 1

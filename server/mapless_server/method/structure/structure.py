@@ -159,7 +159,7 @@ class RefinedPoints:
 
     Attributes:
         x_in_world: (P, 3) metres.
-        observations: of these points, without outliers.
+        observations: observations of these points, without outliers.
         trusted: (P,) which points to keep.
         noise: noise of the keypoints.
     """
@@ -187,7 +187,7 @@ def refine_points(observations: Observations, x_in_world: Array, options: Struct
 
 
 def trustworthy(observations: Observations, x_in_world: Array, options: StructureOptions) -> NDArray[np.bool_]:
-    """Which points (P,) are finite, fit all their observations and have enough parallax."""
+    """Mask (P,) of the points that are finite, fit all their observations and have enough parallax."""
     limit = options.max_residual_sigma
     explained = observations.max_by_point(length(observations.residuals(x_in_world).T)) < (limit or np.inf)
     direction = take(columns(x_in_world), observations.tracks.point) - observations.rays()[0]

@@ -51,7 +51,7 @@ class Resection:
         pixels: (N, 2) where they are seen.
         sigma_px: (N,) standard deviation of each coordinate.
         loss_scale_sigma: scale of the Cauchy loss, in standard deviations.
-        unknowns: which of v, w and s are free.
+        unknowns: those of v, w and s that are free.
         behind_sigma: residual of a point behind the camera; if NaN, no step may move a point there.
         shorten_all: whether a step with a larger change of s than `MAX_LOG_STEP` is shortened as a whole, which keeps
             its direction near the minimum, or in s alone, so that a pose far from the minimum still moves by the full

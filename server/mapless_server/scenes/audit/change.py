@@ -27,7 +27,7 @@ SAME_VIEWPOINT = Visibility(max_turn_deg=8.0, max_scale=1.25)
 neighbours at its own viewpoint count, which the wall would hide, too."""
 
 _COLUMNS, _ROWS = 8, 6
-"""Of the grid of cells."""
+"""Size of the grid of cells."""
 _RADIUS_PX, _MIN_SIMILARITY = 6.0, 0.8
 """A point is found if a keypoint whose descriptor has at least this cosine is this near to its projection."""
 _MISSING_SHARE, _MAX_CHANCE = 0.15, 1e-3
@@ -87,7 +87,7 @@ def find_change(comparison: Comparison, limits: Visibility) -> Change | None:
 
 
 def _missing(expected: NDArray[np.intp], found: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which cells have changed, and which have enough points to be judged."""
+    """Masks of the cells that have changed, and of those with enough points to be judged."""
     usual = _usual_share(expected, found)
     limit = _MISSING_SHARE * usual
     # A cell can be judged if finding none of its points would be unlikely by chance.
@@ -110,7 +110,7 @@ _LEAST_SHARE = 0.15
 
 
 def _found(subject: PosedView, neighbourhood: Neighbourhood, visible: Visible) -> NDArray[np.bool_]:
-    """Which visible points (V,) have a similar keypoint nearby."""
+    """Mask (V,) of the visible points that have a similar keypoint nearby."""
     nothing = np.empty(0, np.intp)
     known = PointMatches(nothing, nothing, np.empty(0, bool), _RADIUS_PX)
     options = MatchOptions(radius_px=_RADIUS_PX, min_similarity=_MIN_SIMILARITY)

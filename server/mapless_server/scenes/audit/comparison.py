@@ -41,15 +41,16 @@ _FOCAL_TOLERANCE = 0.02
 """Smaller errors of the focal length, as a share, are no fault: the worst unaltered one is 0.007, and faults of 0.05
 are found to be 0.045 to 0.055."""
 SIGNIFICANCE_SIGMA = 3.0
-"""An offset must also exceed this many of its own standard deviations along its direction (from the matches, doubled as
-in the method's final adjustment),"""
+"""A pose is wrong only if its offset also exceeds this many of its own standard deviations along its direction (from
+the matches, doubled as in the method's final adjustment)."""
 _NEIGHBOUR_NOISE = 3.0
-"""and this many times the median offset of its neighbours: if all poses are off by 10 cm, as at one end of a drive with
-GPS poses, no single one is at fault."""
+"""A pose is wrong only if its offset also exceeds this many times the median offset of its neighbours: if all poses are
+off by 10 cm, as at one end of a drive with GPS poses, no single one is at fault."""
 _MIN_INLIERS = 25
 """With fewer there is no verdict. Repeated texture has given up to 23 wrong ones."""
 _MAX_LOG10_FALSE_ALARMS = -6.0
-"""As in `gate`, with a reserve, since an audit makes thousands of decisions."""
+"""Bound of chance as for acceptance (`pnp.MAX_LOG10_FALSE_ALARMS`), with a reserve, since an audit makes
+thousands of decisions."""
 _BOTH_EXCESS = 2.0
 """If a changed pose alone and a changed focal length alone leave more robust cost per match than this, both are wrong.
 One true cause leaves up to 0.75, two leave 4."""
@@ -64,7 +65,7 @@ _CHANGED = {
     AuditVerdict.WRONG_INTRINSICS: Free.FOCAL,
     AuditVerdict.WRONG_POSE_AND_INTRINSICS: Free.BOTH,
 }
-"""What an alarm says is wrong."""
+"""The part that is wrong, by the alarm that names it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,7 +42,7 @@ LEAST_MATCHES = 20.0
 ENOUGH_IMAGE_SHARE, MAX_RADIUS_M = 0.15, 0.5
 """A pose from a smaller share of the image, or less accurate, is doubtful."""
 COLUMNS, ROWS = 8, 6
-"""Of the grid that the image is divided into."""
+"""Size of the grid that the image is divided into."""
 
 
 def check_coverage(

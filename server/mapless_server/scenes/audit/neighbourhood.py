@@ -132,7 +132,7 @@ def observed_points(subject: PosedView, neighbourhood: Neighbourhood, found: Poi
 
 @dataclass(frozen=True)
 class Visibility:
-    """What counts as seen from about the same direction and distance.
+    """Limits within which a point counts as seen from about the same direction and distance.
 
     Attributes:
         max_turn_deg: largest angle between the viewing rays of the camera and of a reference that observes the point.

@@ -30,7 +30,7 @@ anew: with that of the start, some fits ended metres away from a right pose, whe
 
 
 class Free(Enum):
-    """What a fit may change; the value lists the indices into x y z rx ry rz focal."""
+    """The parameters that a fit may change; the value lists the indices into x y z rx ry rz focal."""
 
     NOTHING = ()
     POSE = (0, 1, 2, 3, 4, 5)

@@ -46,7 +46,7 @@ PROCESSED_SIDE_PX = 1024
 
 @dataclass(frozen=True, eq=False)
 class SceneTools:
-    """What chooses, loads and compares the references of all scenes.
+    """The tools that choose, load and compare the references of all scenes.
 
     The extractor is the first tier's, whose features every reference has; `pairs` caches matches, for all calls
     together.

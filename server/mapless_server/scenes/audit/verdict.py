@@ -7,7 +7,7 @@ from mapless.geometry import Camera, RigidTransform
 
 
 class AuditVerdict(str, Enum):
-    """What is wrong with a reference; the worst first."""
+    """Faults of a reference, the worst first."""
 
     SWAPPED_IMAGE = "swapped_image"
     """Its photograph was taken at another reference's pose, and vice versa."""
@@ -45,7 +45,7 @@ class ReferenceAudit:
 
     Attributes:
         reference: its name.
-        verdict: what is wrong with it.
+        verdict: its fault, if any.
         message: the verdict as a sentence, with the numbers.
         neighbour_count: references that it was compared with.
         match_count: matches of its keypoints with points that these references triangulate.

@@ -93,7 +93,7 @@ def shared_errors(subject: PosedView, others: Sequence[PosedView], matches: Sequ
 
 
 def lens_contradiction(found: Sequence[SharedErrors]) -> SharedErrors | None:
-    """What several references contradict together, zeros where they do not; None if they fit calibrated lenses.
+    """Errors that several references show together, zeros where they do not; None if they fit calibrated lenses.
 
     The error is the median, so that a single wrong pose does not matter; its standard deviation follows from their
     spread too, so that references that disagree do not become certain by their number alone.

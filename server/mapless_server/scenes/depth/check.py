@@ -29,8 +29,8 @@ MAX_OFF, MAX_OFF_DEG = 0.1, 5.0
 """Largest error of the predicted pose that was not given: of its position as a share of the median depth, and of its
 rotation. Networks are better by far where they understand a place."""
 MIN_PARALLAX_DEG = 2.0
-"""Of triangulated points: at 2 degrees a keypoint's error of half a pixel, at a focal length of 500 px, is 3 % of the
-depth."""
+"""Least parallax of triangulated points: at 2 degrees a keypoint's error of half a pixel, at a focal length of 500 px,
+is 3 % of the depth."""
 MIN_POINTS = 20
 """Triangulated points of a reference."""
 MAX_SCALE = 1.25
@@ -45,7 +45,7 @@ MAX_WRONG = 0.3
 MAX_STEP = 1.1
 """Largest factor between the depths of neighbouring pixels that are of one surface."""
 MIN_CONFIDENCE = 0.1
-"""Of the network, for which a depth is kept."""
+"""Least confidence of the network for which a depth is kept."""
 
 
 def checked_depths(

@@ -53,7 +53,7 @@ class GlobalDescriptor(Protocol):
 Rows = NDArray[np.intp]
 
 _CHUNK_BYTES = 1 << 20
-"""Of float32 that are converted at a time: what fits a core's cache."""
+"""Bytes of float32 that are converted at a time, so that they fit a core's cache."""
 
 _LARGEST = 127
 _SMALLEST_CAPACITY = 64

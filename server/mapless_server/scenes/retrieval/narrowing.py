@@ -1,4 +1,4 @@
-"""What is known of a camera's pose before its photograph is compared with references: limits and likely values.
+"""Knowledge of a camera's pose before its photograph is compared with references: limits and likely values.
 
 Limits are hard: references beyond them are not considered, and a pose beyond them is rejected. Likely values narrow the
 choice of references, too, but not to nothing, and never reject a pose.
@@ -37,7 +37,7 @@ class Sphere:
         return float(np.linalg.norm(position - self.position)) - self.radius_m
 
     def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
-        """Which centres (N, 3) are outside by at most the margin."""
+        """Mask (N,) of the centres (N, 3) that are outside by at most the margin."""
         # Not squared: a radius may be any number.
         return np.asarray(np.linalg.norm(centres - self.position, axis=1) <= self.radius_m + margin_m)
 
@@ -50,7 +50,7 @@ class Ellipsoid:
     covariance: Array
 
     def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
-        """Which centres (N, 3) are in the ellipsoid with each half-axis longer by the margin."""
+        """Mask (N,) of the centres (N, 3) in the ellipsoid with each half-axis longer by the margin."""
         variances, axes = np.linalg.eigh(self.covariance)
         half_axes_m = REACH_SIGMA * np.sqrt(variances.clip(min=0)) + margin_m
         away = (centres - self.position) @ axes / half_axes_m
@@ -74,7 +74,7 @@ class Cone:
         return float(np.degrees(np.arccos(np.clip(self.forward @ axis, -1.0, 1.0)))) - self.max_angle_deg
 
     def keeps(self, axes: Array, margin_deg: float) -> NDArray[np.bool_]:
-        """Which optical axes (N, 3) are outside the cone by at most the margin."""
+        """Mask (N,) of the optical axes (N, 3) that are outside the cone by at most the margin."""
         widest_deg = self.max_angle_deg + margin_deg
         if widest_deg >= 180:
             return np.ones(len(axes), bool)
@@ -155,7 +155,7 @@ class Narrowing:
         return ""
 
     def keeps(self, centres: Array, axes: Array) -> NDArray[np.bool_]:
-        """Which cameras are considered, by centres (N, 3) and optical axes (N, 3) in the world."""
+        """Mask (N,) of the cameras that are considered, by centres (N, 3) and optical axes (N, 3) in the world."""
         kept = np.ones(len(centres), bool)
         if self.position is not None:
             kept &= self.position.keeps(centres, self.margin_m)
@@ -171,7 +171,7 @@ class Narrowing:
 
 
 ANYWHERE = Narrowing()
-"""Of queries without priors."""
+"""The narrowing of queries without priors: none."""
 
 
 def _likely(forward: Array, sigma_deg: float) -> Cone:

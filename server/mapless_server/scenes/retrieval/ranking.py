@@ -64,7 +64,7 @@ THINNED_LATER = RankOptions(nearby_weight=1.0)
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Which references to select.
+    """A choice of references: how many, and within which limits.
 
     Attributes:
         count: largest number of references.

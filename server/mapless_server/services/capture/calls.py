@@ -100,7 +100,7 @@ class CapturedCall:
         tenant: tenant of the caller.
         scene_id: id of the scene within its tenant.
         scene_created_us: when the scene was created, Unix microseconds; distinguishes scenes of one name.
-        circumstances: what else decides an answer (versions, settings, weights), by name.
+        circumstances: all else that decides an answer (versions, settings, weights), by name.
         attributes: attributes of the scene.
         parts: one for each photograph.
         request: the message as it was received.

@@ -23,7 +23,7 @@ class ReferencesDeleted(Exception):
 
 @dataclass(frozen=True, eq=False)
 class UsedReferences:
-    """What a photograph was compared with, by key only, so that a queued call needs little memory.
+    """The references that a photograph was compared with, by key only, so that a queued call needs little memory.
 
     `used` are the keys of the references that the answer was computed from, `wanted` those, by id, of the references
     that were named or ranked. Field, generation and choices are as of `CapturedPart`.

@@ -26,7 +26,7 @@ class AnswerFrames:
     """The form in which a caller requests its answer.
 
     Attributes:
-        axes: of its camera, besides OpenCV's.
+        axes: axes of its camera, besides OpenCV's.
         session_from_camera: the device's pose at the time of capture, in these axes; None if the request has none.
         includes_imprecise: whether a pose that is rejected for its radius alone goes with the rejection.
     """

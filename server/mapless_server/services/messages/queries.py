@@ -40,7 +40,7 @@ from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
 FIRST_TIME_S, LAST_TIME_S = -62_135_596_800, 253_402_300_799
-"""Of google.protobuf.Timestamp."""
+"""Range of google.protobuf.Timestamp."""
 
 E = TypeVar("E", bound=Enum)
 
@@ -124,10 +124,11 @@ def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
 
 
 MIN_SEEN_SHARE = 0.1
-"""Of an image, which a lens must show: a fisheye's circle shows 0.3 at least; wrong coefficients may show nothing."""
+"""Least share of an image that a lens must show: a fisheye's circle shows 0.3 at least; wrong coefficients may show
+nothing."""
 
 LEAST_SIGMA = 1e-6
-"""Of intrinsics, as a share: they are exact, and their inverse squares are finite."""
+"""Least standard deviation of intrinsics, as a share: they are exact, and their inverse squares are finite."""
 
 MAX_REFERENCES = 64
 MAX_CANDIDATES = 1000
@@ -215,17 +216,18 @@ def options_from_message(
 
 
 UNKNOWN_HEIGHT_SIGMA_M = 1000.0
-"""Of a receiver without a height: all buildings are within three of these above or below the datum."""
+"""Standard deviation for a receiver without a height: all buildings are within three of these above or below the
+datum."""
 
 MIN_SIGMA_M, MAX_SIGMA_M = 1e-4, 1e6
-"""Of a position: finer than any survey, wider than any scene."""
+"""Range for a position: finer than any survey, wider than any scene."""
 
 MIN_SIGMA_RATIO = 1e-5
-"""Of two directions of a position: rotated to the scene's axes, a smaller one would be lost to rounding. So without a
-height, positions are certain to 1 cm at most."""
+"""Least ratio for two directions of a position: rotated to the scene's axes, a smaller one would be lost to rounding.
+So without a height, positions are certain to 1 cm at most."""
 
 MIN_SIGMA_DEG, MAX_SIGMA_DEG = 1e-3, 90.0
-"""Of a direction; beyond 90 degrees a prior has no effect."""
+"""Range for a direction; beyond 90 degrees a prior has no effect."""
 
 
 def needs_attributes(request: Any) -> bool:

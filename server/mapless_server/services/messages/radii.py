@@ -47,7 +47,7 @@ class Factors:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What computed an answer; factors hold only for answers of the same conditions.
+    """The means that computed an answer; factors hold only for answers of the same conditions.
 
     The name of the features contains their options, "sift-2048-1024px-0.02"; the variant is named as by `Diagnostics`,
     "BEST". Another version of the server may report other radii.
@@ -89,7 +89,7 @@ def reported_radii(
     Args:
         accuracy: radii of the method.
         covariance: (6, 6) of the method.
-        conditions: what computed the answer.
+        conditions: the means that computed the answer.
         kind: kind of the answer, see `store.calibration_kind`; with depths kept with references another one.
         attributes: attributes of the scene.
         gap: gap of the answer, see `method.bundle.estimate.viewpoint_gap`; None if unknown.

@@ -69,7 +69,7 @@ class ReadOptions:
         ground_truth: poses that replace the layout's own: a file or folder of SfM pseudo ground truth, for `7scenes`
             and `12scenes`.
         intrinsics: for layouts without them (`7scenes`, `tum`, recordings); None for the layout's usual ones.
-        bag, keyframes: which topics, frames and images of a recording are used; only for `rosbag`.
+        bag, keyframes: topics, frames and images of a recording that are used; only for `rosbag`.
     """
 
     images: Path | None = None

@@ -27,7 +27,7 @@ from .writing import image_name
 CANDIDATES = 5
 """Images of which the sharpest becomes a keyframe; at 30 Hz, a sixth of a second."""
 SLACK = 0.2
-"""Of the distance and the angle: the candidates are no farther from the first of them."""
+"""Tolerance of distance and angle, as a share: the candidates are no farther from the first of them."""
 
 
 def fits(path: Path) -> bool:

@@ -78,7 +78,7 @@ class AlikedExtractor:
 
 @dataclass(frozen=True, eq=False)
 class Maps:
-    """What the network computes of an image.
+    """The maps that the network computes of an image.
 
     Attributes:
         scores: (1, 1, H, W) in 0 to 1.

@@ -1,4 +1,4 @@
-"""What the learned extractors share: their options, and maxima of score maps."""
+"""The common parts of the learned extractors: their options, and maxima of score maps."""
 
 from dataclasses import dataclass
 from functools import reduce

@@ -56,8 +56,8 @@ class Alignment:
         bad_share: share of the pairs that do not fit with it.
         pair_count: number of pairs.
         scale_sigma: standard deviation of the scale, relative.
-        rotation_sigma_deg: of the rotation.
-        position_sigma: of the position of the other session's middle, as a share of its extent.
+        rotation_sigma_deg: standard deviation of the rotation.
+        position_sigma: standard deviation of the position of the other session's middle, as a share of its extent.
     """
 
     world_from_other: Similarity
