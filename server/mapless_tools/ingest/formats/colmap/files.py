@@ -1,8 +1,8 @@
 """COLMAP's files of cameras and images, binary and text, record by record; observations are skipped.
 
-They are not read by pycolmap, which accepts truncated files (docs/decisions.md). Binary files are little
-endian and have no checksum, so every step is compared with the file's size. Observations make files of gigabytes:
-binary ones are mapped, text is read by the line.
+They are not read by pycolmap, which accepts truncated files: see docs/decisions/035-own-readers.md. Binary files are
+little endian and have no checksum, so every step is compared with the file's size. Observations make files of
+gigabytes: binary ones are mapped, text is read by the line.
 """
 
 import mmap
