@@ -22,10 +22,12 @@ from mapless_server.engine import choosing
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import MIRROR, Caller, Photo, Query, Result, Tier
-from mapless_server.engine.search import Search
+from mapless_server.engine.search import Material, Search
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.bundle.priors import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.features.extractors import SiftExtractor
+from mapless_server.method.features.extractors.turned import extract_turned
+from mapless_server.method.features.rolls import Similarity
 from mapless_server.method.features.views import Ignored, View, view_of
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import DoubtOptions, LocalizeOptions
@@ -125,6 +127,32 @@ def test_a_turned_photograph_gets_the_pose_of_its_raster(
     off_m, off_deg = pose_error(outcome.world_from_camera, true)
     assert off_m < 0.01
     assert off_deg < 0.2
+
+
+def test_features_of_all_rasters_are_the_strongest_first() -> None:
+    image, found = decode_image(photograph(TRUE), ImageLimits()), SiftExtractor()
+    one, other = (extract_turned(found, image, CAMERA, [angle_deg]) for angle_deg in (0.0, 90.0))
+    both = extract_turned(found, image, CAMERA, (0.0, 90.0)).features
+    np.testing.assert_allclose(both.keypoints[0:20:2], one.features.keypoints[:10])
+    np.testing.assert_allclose(both.keypoints[1:20:2], other.features.keypoints[:10])
+
+
+@pytest.mark.parametrize(
+    ("agreeing", "is_part", "has_depths", "expected"),
+    [
+        ((64, 36, 4), False, False, 3.6),
+        ((64,), False, False, 0.0),
+        ((64, 4), True, False, 4.9),
+        ((64, 4), False, True, 4.9),
+    ],
+)
+def test_agreement_is_that_of_the_references_a_pose_needs(
+    agreeing: tuple[int, ...], is_part: bool, has_depths: bool, expected: float
+) -> None:
+    found = [Similarity(0.0, it, 100) for it in agreeing]
+    references = [SimpleNamespace(depths=object() if has_depths else None) for _ in agreeing]
+    material = cast(Material, SimpleNamespace(references=references))
+    assert choosing.agreement_of(found, material, is_part) == pytest.approx(expected)
 
 
 def test_an_upright_photograph_is_not_tried_turned(localize: Localize) -> None:

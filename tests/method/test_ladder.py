@@ -87,6 +87,13 @@ def test_upright_features_are_found_turned_as_the_roll_is_known(before: Attempt)
     assert before.features == 1 or changed["any roll"] == Attempt(1)
 
 
+def test_stronger_features_are_not_turned_where_most_matches_are_upright() -> None:
+    situation = Situation(can_match_strongly=(False, False), angles_deg=(0.0, 90.0))
+    changed = {rung.name: it for rung, it in further(Attempt(), [Attempt()], Doubt.STARVED, situation)}
+    assert changed["turned"].angles_deg == (0.0, 90.0)
+    assert changed["stronger"] == Attempt(1)
+
+
 def test_tracking_comes_first_where_a_prior_says_what_is_near() -> None:
     name, attempt = first_attempt(True)
     assert (name, attempt.where) == (TRACKED, Where.NEAR_PRIOR)

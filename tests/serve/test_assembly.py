@@ -14,6 +14,7 @@ from mapless_server.networks.weights import WeightsMissing
 from mapless_server.observability.metrics import Metrics
 from mapless_server.serve import assembly
 from mapless_server.serve.assembly import (
+    ANY_ROLL_PIXELS,
     StartupError,
     feature_names,
     make_engine,
@@ -92,6 +93,7 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
             assert feature_names(settings(tmp_path), device) == ("edgepoint2-l64", "sift")
         tier, any_roll = make_tiers(settings(tmp_path, device="cpu"))
     assert (tier.any_roll, any_roll.any_roll) == (False, True)
+    assert (tier.max_pixels, any_roll.max_pixels) == (None, ANY_ROLL_PIXELS)
     assert tier.extractor.name.startswith("edgepoint2-l64-")
     chosen, record = caplog.records
     assert chosen.getMessage() == f"descriptors are multiplied as {fastest_arithmetic().value}"
@@ -107,7 +109,7 @@ def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> No
 
 def test_a_server_without_networks_does_not_load_torch(tmp_path: Path) -> None:
     program = """if True:
-        import sys; from pathlib import Path; from mapless_server.serve.assembly import make_tiers
+        import sys; from pathlib import Path; from mapless_server.serve.assembly import ANY_ROLL_PIXELS, make_tiers
         from mapless_server.settings import Settings
         make_tiers(Settings(data_dir=Path(sys.argv[1]), weights_dir=Path(sys.argv[1])))
         print('torch' in sys.modules)

@@ -27,6 +27,7 @@ from mapless_server.method.features.rolls import (
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.decide import PLACES
 from mapless_server.method.judge.hypothesis import Found, Hypothesis, Raster, Where
+from mapless_server.method.promise import PROMISE
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Choice, Narrowing, Selection
 from mapless_server.scenes.library import Loaded, load_usable
@@ -44,8 +45,11 @@ SHORTLIST = 2
 """So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
 BENCHMARKS.md)."""
 
+ALONE_BY_CHANCE = LEAST_AGREEMENT - PROMISE.agreement
+"""By so much the agreement of one reference exceeds that of two, where both are as likely by chance."""
+
 MIRROR_REFERENCES = 5
-"""A photograph and its mirror image are compared with so many references, the most similar first."""
+"""A photograph and its mirror image are compared with so many references, the most similar, or with all named ones."""
 
 MIRRORED_BY_CHANCE = 1e-6
 """A photograph is mirrored only if matches that are as likely with it as with its mirror image would be shared so
@@ -92,15 +96,22 @@ def compared(search: Search) -> Search:
         return search
     pairs = zip(material.references, material.query_matches, strict=True)
     found = [similarity_of(material.view, reference.view, matches) for reference, matches in pairs]
-    search = replace(search, agreement=max(search.agreement, _agreement_of(found, material.references)))
+    agreement = max(search.agreement, agreement_of(found, material, search.query.is_part))
+    search = replace(search, agreement=agreement)
     is_upright = search.attempt.raster is Raster.AS_IS
     return replace(search, angles_deg=_rasters_by(search, material, found)) if is_upright else search
 
 
-def _agreement_of(found: Sequence[Similarity | None], references: Sequence[PosedView]) -> float:
-    """The agreement that as many references reach as a pose needs: two, or one that has depths."""
-    needed = 1 if any(it.depths is not None for it in references) else min(2, len(found))
-    return sorted((it.agreement if it else 0.0 for it in found), reverse=True)[needed - 1]
+def agreement_of(found: Sequence[Similarity | None], material: Material, is_part: bool) -> float:
+    """The agreement that as many references reach as a pose needs: two.
+
+    One that has depths is enough, and so is one for a rig's or sequence's photograph, which others help; chance reaches
+    more with one of many than with two.
+    """
+    agreements = [it.agreement if it else 0.0 for it in found]
+    alone = [a for a, it in zip(agreements, material.references, strict=True) if is_part or it.depths is not None]
+    _, second, *_ = sorted([*agreements, 0.0, 0.0], reverse=True)
+    return max([second, *(it - ALONE_BY_CHANCE for it in alone)])
 
 
 def _rasters_by(search: Search, material: Material, found: Sequence[Similarity | None]) -> tuple[float, ...]:
@@ -196,8 +207,8 @@ def _outside(search: Search, choice: Choice, tier: Tier) -> list[tuple[str, int]
     """Ids of references that resemble the photograph and were not chosen, with their rank among all."""
     inside = {it.reference_id for it in choice.references}
     with search.context.stage("retrieval"):
-        views = search.views if search.material is None else search.material.views
-        alike = _shortlisted(search, views, search.query.narrowing.limits, tier).references
+        assert search.material is not None
+        alike = _shortlisted(search, search.material.views, search.query.narrowing.limits, tier).references
     return [(it.reference_id, rank) for rank, it in enumerate(alike) if it.reference_id not in inside]
 
 
@@ -272,7 +283,7 @@ def _most_matches(search: Search, views: QueryViews, tier: Tier) -> tuple[int, s
         chosen = _shortlisted(search, views, _narrowing_of(search), tier).references[:MIRROR_REFERENCES]
         references = load_chosen(search, [it.reference_id for it in chosen], tier)[1]
     else:
-        references = _load(search, query.reference_ids[:MIRROR_REFERENCES], tier)[1]
+        references = _load(search, query.reference_ids, tier)[1]
     with search.context.stage(MIRROR):
         matches = tier.pipeline.matcher.match_quickly(view, references, search.context.check)
     counts = list(map(len, matches))

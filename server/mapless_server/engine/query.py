@@ -120,7 +120,8 @@ class Tier:
     def kind(self) -> str:
         """Kind of its answers, see `calibration_kind`."""
         backend = f"{self.backend}+depth" if self.uses_depths else self.backend
-        return calibration_kind(self.features, backend, __version__)
+        features = self.features if self.max_pixels is None else f"{self.features}-{self.max_pixels}"
+        return calibration_kind(features, backend, __version__)
 
     @property
     def weights_sha256(self) -> str:
@@ -194,7 +195,7 @@ class Tried:
         outcome: "localized", the value of the rejection's reason, or how it ended without a verdict, such as "failed".
         seconds: its computing time.
         processor_s: its processor time.
-        agreement: the largest that matches with two references have shown until then, see `features.rolls`.
+        agreement: the largest that matches with references have shown until then, see `choosing` and `features.rolls`.
         is_chosen: whether the answer came from it.
     """
 

@@ -125,7 +125,7 @@ class Search:
         prepared: the photographs' matches, for the stage `coarse`.
         coarse: the reconstruction that attempts of the material's basis begin with.
         angles_deg: by how much to turn the photograph, see `Situation`.
-        agreement: the largest that its matches with two references have shown so far, see `features.rolls`.
+        agreement: the largest that its matches with references have shown so far, see `choosing` and `features.rolls`.
     """
 
     query: Query

@@ -139,8 +139,10 @@ class QueryStages:
         search = search.resumed()
         try:
             return compute(search)
-        except Exception as error:
-            failure = error
+        except Exception as error:  # not kept in a variable, or its traceback would keep what was computed
+            return self._failed(search, error)
+
+    def _failed(self, search: Search, failure: Exception) -> SearchResult:
         if isinstance(failure, Abandoned) or failure_of(failure) is Failure.DEVICE_LOST:
             return failure
         # A reference deleted since the scene was listed was not the caller's choice: the next list is without it.

@@ -76,7 +76,7 @@ STRENGTHENED = (
 def _with_features(features: int, before: Attempt, situation: Situation) -> Attempt:
     """Features of the photograph, turned if they must be upright and are known not to be."""
     where = Where.LIKELY if before.where is Where.ONE_PLACE else before.where
-    # A raster of expensive features costs as much as all attempts before, so there is one: that of most matches.
+    # A raster of stronger features costs as much as all attempts before, so there is one: that of most matches.
     angles_deg = situation.angles_deg if features == 0 else situation.angles_deg[:1]
     if features == situation.any_roll or angles_deg in ((), (0.0,)):
         return Attempt(features, where=where)

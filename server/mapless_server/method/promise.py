@@ -18,7 +18,7 @@ class Worth:
     """Gain and cost of an attempt.
 
     Attributes:
-        cost_s: processor time of a core, seconds; of `rematched`, with the first two references.
+        cost_s: processor time of a core, seconds, with what follows it; of `rematched`, with the first two references.
         found: share of the photographs without an accepted pose, but with references that agree, that it, or what
             follows it, answers.
         corrected: share of the wrong answers that it, or what follows it, corrects; None if it also makes right answers
@@ -39,7 +39,7 @@ WORTH: Mapping[str, Worth] = {
     "lines": Worth(0.4, 0.2, 0.0),
     "lines at any roll": Worth(0.4, 0.007, 0.0),
     "wide at any roll": Worth(0.15, 0.03, 0.1),
-    "stronger": Worth(2.0, 0.4, 0.3),
+    "stronger": Worth(3.0, 0.4, 0.3),
     "rematched": Worth(1.0, 0.3, 0.2),
 }
 """By the name of the rung; those that are not listed are always worth it. Evidence: rungs-worth, rungs."""

@@ -124,7 +124,8 @@ class SceneIndexes:
         for reference_id, key in undescribed:
             if key not in cached.scheduled:
                 cached.scheduled.add(key)
-                self._library.later(partial(self._describe_scheduled, scene_key, cached, reference_id, key))
+                describe = partial(self._describe_scheduled, scene_key, cached, reference_id, key)
+                self._library.later(scene_key, reference_id, describe)
 
     def _describe_scheduled(self, scene_key: SceneKey, cached: _CachedIndex, reference_id: str, key: str) -> None:
         try:

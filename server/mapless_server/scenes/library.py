@@ -135,7 +135,8 @@ class ReferenceLibrary:
         if new:
             _log_describing(new, extractor)
         for record in new:
-            self.later(partial(self._describe_scheduled, record, extractor))
+            describe = partial(self._describe_scheduled, record, extractor)
+            self.later(record.scene_key, record.reference_id, describe)
 
     def _describe_scheduled(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
         """Describes one reference; one that is damaged is not tried again, one that the store did not take now is."""
@@ -146,17 +147,17 @@ class ReferenceLibrary:
                 self._scheduled.discard((record.key, extractor.name))
             raise
 
-    def later(self, describe: Callable[[], None]) -> None:
-        """Describes in the background, after what is to be described already."""
-        self._background.submit(self._in_background, describe)
+    def later(self, scene_key: SceneKey, reference_id: str, describe: Callable[[], None]) -> None:
+        """Describes a reference in the background, after what is to be described already."""
+        self._background.submit(self._in_background, scene_key, reference_id, describe)
 
-    def _in_background(self, describe: Callable[[], None]) -> None:
+    def _in_background(self, scene_key: SceneKey, reference_id: str, describe: Callable[[], None]) -> None:
         if self._closing.is_set():
             return
         try:
             describe()
         except Exception as error:  # a damaged or deleted reference must not keep the others from being described
-            log.warning("a reference is not described: %s", error)
+            log.warning("reference %s of scene %s is not described: %s", reference_id, scene_key, error)
 
     def _describe_all(
         self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor, check: Callable[[], None]

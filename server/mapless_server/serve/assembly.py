@@ -243,7 +243,7 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     arithmetic = Arithmetic.FLOAT32 if [*extractors] == [WITHOUT_WEIGHTS] else fastest_arithmetic()
     log.info("descriptors are multiplied as %s", arithmetic.value)
     matchers = {
-        # A stronger tier on a CPU has LightGlue, half a second per pair.
+        # A stronger tier on a CPU has LightGlue, a third of a second per pair.
         name: make_matcher(name, cores, _find_light_glue(name, settings, missing), arithmetic=arithmetic)
         if device == "cpu" and name != first
         else _make_matcher(name, settings, device, arithmetic)

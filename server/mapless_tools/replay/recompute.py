@@ -182,12 +182,12 @@ class RecordedSource:
         choices = tuple(it for it in choices if it.descriptor != POSE_PRIOR) or choices
         if not choices:
             raise DamagedCapture("no choice of references was captured")
+        wants_own = extractor is not None and extractor.name == self.any_roll
         if self.is_described:
-            views.view(self.extractor, context)
+            views.view(extractor if extractor is not None and wants_own else self.extractor, context)
             with context.stage(RETRIEVAL):  # it takes no time, but the answer lists it
                 pass
         is_own = {it.descriptor: self.any_roll is not None and it.descriptor.endswith(self.any_roll) for it in choices}
-        wants_own = extractor is not None and extractor.name == self.any_roll
         return next((it for it in choices if is_own[it.descriptor] == wants_own), choices[0])
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:

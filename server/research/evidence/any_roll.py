@@ -31,7 +31,9 @@ QUESTION = Question(
     "two photographs of each folder of shared/data, turned by 45 degrees, and one of another place, with 5 references "
     "that are evenly spread and have SIFT of the whole photograph. Two references agree if the photograph's matches "
     f"with both have an agreement of {PROMISE.agreement:g} (see place-agreement).",
-    "As many photographs as with all pixels have two references that agree, at the lowest cost.",
+    "All photographs but one that have two references that agree with all pixels, for less than half of the time. The "
+    "references were given, not chosen by the smaller raster; how accurate the poses are is not part of it: on "
+    "`chess-king`, where references are chosen, all 14 photographs are localized, with a median error of 0.1 %.",
 )
 PIXELS = (320 * 240, 480 * 360, 640 * 480, 960 * 720, None)
 ANGLE_DEG = 45

@@ -43,7 +43,7 @@ QUESTIONS = {
         "How many matches must one of the two best references have for the others to be matched, too?",
         DATA,
         "Three of 22 photographs of other places have so many; those of the place have at least 108 where matches are "
-        "right. Hard ones have fewer, so it is not the 40 that no other place reaches.",
+        "right. Hard ones have fewer, so 30 was chosen rather than 40, which no other place reaches.",
     ),
 }
 KEYPOINTS = (256, 512, 1024)

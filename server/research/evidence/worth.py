@@ -24,9 +24,10 @@ QUESTIONS = {
         "a rung answer, at what cost?",
         DATA,
         "An attempt is made if its share, times the chance that two references show the same (see place-agreement), is "
-        "at least 0.02 for each second. `stronger` includes what follows it: 2 of 4 photographs here, 4 of 9 of the "
-        "list of doubtful ones. Costs are those of a quiet machine with stored pairs of references, which `wide` and "
-        "`rematched` did not have here; shares at any roll are those of an earlier measurement with more photographs "
+        "at least 0.02 for each second. `stronger` includes what follows it, time and answers: of 4 photographs here "
+        "that get a network 2 are answered right, of 9 of the list of doubtful ones 4. Costs are those of a quiet "
+        "machine with stored pairs of references, which `wide` and `rematched` did not have here; shares at any roll "
+        "are those of an earlier measurement with more photographs "
         "(0 of 9 and 1 of 40). An accepted pose is checked by stronger features only if it is of low trust and no "
         "other features found one there: of 29 such poses in a hundred that are wrong (2,528 photographs, see "
         "`DoubtOptions`) stronger features are assumed to correct a third, which is not measured.",
@@ -37,12 +38,13 @@ QUESTIONS = {
         "How large an agreement of matches (see `features.rolls.Similarity`) do two references reach, of photographs "
         "of the place and of others, after the photograph as it is and SIFT, where the first attempt left a doubt?",
         DATA,
-        "A pose needs two references, so the second largest agreement counts: above all of other places, below those "
-        "that a network answers right (3.4 and more; the three right ones below 3.0 were answered without). Chosen by "
-        "the other places alone, half way between the two, it differs where one of the two nearest is left out: the "
-        "last row. The chance falls over 0.25, so that at 2.4 the cheap rungs are still tried, but no network: of the "
-        "list of doubtful photographs `wide` answers one there for 0.07 s. "
-        "`rolls.LEAST_AGREEMENT` is for a single reference, which other places reach 4.4 with.",
+        "A pose needs two references, so the second largest agreement counts. 3.0 is above all photographs of other "
+        "places and below those that a network answers right (3.4 and more; the three right ones below 3.0 were "
+        "answered without one). Chosen by the other places alone, half way between the two, it differs where one of "
+        "the two nearest is left out: the last row. The logistic's spread is 0.25, so that at 2.4 the cheap rungs are "
+        "still tried, but no stronger features: of the list of doubtful photographs `wide` answers one there for 0.07 "
+        "s. `rolls.LEAST_AGREEMENT` is for a single reference: in an earlier run of this program, with the largest "
+        "agreement instead of the second, photographs of other places reached 4.4.",
     ),
 }
 THRESHOLDS = (1.5, 2.0, 2.4, 2.7, 3.0, 4.0, 6.0)

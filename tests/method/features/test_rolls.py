@@ -12,6 +12,7 @@ from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.extractors.turned import extract_turned
 from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.rolls import (
+    LARGEST_SWING_DEG,
     LEAST_AGREEMENT,
     apart_deg,
     are_alike,
@@ -60,6 +61,12 @@ def test_the_roll_of_a_rotation_is_its_turn_about_the_axis() -> None:
     assert roll_of_rotation(swing @ roll_about_axis(-70.0)) == pytest.approx(-70.0)
 
 
+@pytest.mark.parametrize("swing_deg", [59.0, 61.0, 180.0])
+def test_cameras_that_look_elsewhere_have_no_roll(swing_deg: float) -> None:
+    swing = Rotation.from_rotvec([0.0, np.radians(swing_deg), 0.0]).as_matrix()
+    assert (roll_of_rotation(swing) is None) == (swing_deg > LARGEST_SWING_DEG)
+
+
 def test_a_direction_seen_by_both_shows_the_roll() -> None:
     down = np.array([0.2, 0.9, 0.3])
     down /= np.linalg.norm(down)
@@ -76,11 +83,13 @@ def test_a_direction_seen_by_both_shows_the_roll() -> None:
         ([], [], ()),
         ([44.0, 50.0, 60.0], [5, 30, 7], (50.0,)),
         ([-90.0, 10.0], [9, 8], (270.0, 0.0)),
+        ([None, 10.0, 90.0], [9, 8, 10], (90.0, 0.0)),
+        ([90.0, None, 95.0], None, (90.0,)),
         ([0.0, 60.0, 120.0, 180.0], [1, 2, 3, 4], (180.0, 120.0, 60.0)),
     ],
 )
 def test_rasters_are_those_of_most_matches(
-    rolls_deg: list[float], counts: list[int], expected: tuple[float, ...]
+    rolls_deg: list[float | None], counts: list[int] | None, expected: tuple[float, ...]
 ) -> None:
     assert rasters_of(rolls_deg, counts) == expected
 

@@ -57,7 +57,7 @@ class Similarity(NamedTuple):
     def agreement(self) -> float:
         """How little like chance it is: wrong matches lie where there is texture, so that some agree, too.
 
-        Those of photographs of different places reach about two, whatever their number.
+        Those of photographs of different places rarely reach three, whatever their number.
         """
         return self.agreeing / math.sqrt(self.total)
 
@@ -108,8 +108,8 @@ def rasters_of(rolls_deg: Sequence[float | None], counts: Sequence[int] | None =
     """The angles, degrees clockwise in [0, 360), by which to turn a photograph with these rolls to references.
 
     Those whose roll is None are left out. The references with the most matches come first, whose angles the rasters
-    have; the others are within twice `UPRIGHT_DEG` of one, if the largest number of rasters suffices. Empty if the
-    photograph as it is suffices.
+    have (without `counts`, the first ones); the others are within twice `UPRIGHT_DEG` of one, if the largest number of
+    rasters suffices. Empty if the photograph as it is suffices.
     """
     chosen: list[float] = []
     order = range(len(rolls_deg)) if counts is None else np.argsort(-np.asarray(counts), kind="stable")

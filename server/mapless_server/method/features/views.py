@@ -59,7 +59,7 @@ class Features:
         return self.keypoints[rows].astype(np.float64)
 
     def first(self, count: int) -> "Features":
-        """The first features, the strongest ones of a raster."""
+        """The first features; learned ones are in the order of their scores, of each raster alike."""
         return Features(self.keypoints[:count], self.descriptors[:count], self.sizes_px[:count])
 
     def every(self, step: int) -> "Features":

@@ -37,7 +37,10 @@ def extract_turned(
     pixels = np.concatenate([it.in_image_px for it in found])
     descriptors = np.concatenate([it.features.descriptors for it in found])
     sizes_px = np.concatenate([it.features.sizes_px * (processed.width_px / it.camera.width_px) for it in found])
-    return view_of(processed, (pixels + 0.5) * share - 0.5, descriptors, sizes_px.astype(np.float32))
+    # The strongest features of each raster come first, as those of one raster do.
+    order = np.argsort(np.concatenate([np.arange(len(it.in_image_px)) for it in found]), kind="stable")
+    pixels = (pixels + 0.5) * share - 0.5
+    return view_of(processed, pixels[order], descriptors[order], sizes_px[order].astype(np.float32))
 
 
 class _InRaster(NamedTuple):
