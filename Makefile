@@ -87,6 +87,8 @@ released: setup  ## At a release: keep the interface that later ones must not br
 demo: setup  ## Localize photographs end to end; DATA=folder for real ones
 	$(BIN)/mapless-server demo $(if $(DATA),--data '$(DATA)')
 
+# The programs that measure are not installed.
+FROM_HERE := PYTHONPATH=client:server
 bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder with the scenes
 	$(BIN)/mapless-server bench $(if $(DATA),'$(DATA)',../shared/data)
 
@@ -94,7 +96,7 @@ bench-turns: setup  ## Compare what a query costs two commits, by turns in one r
 	$(BIN)/python -m mapless_tools.bench.turns '$(BEFORE)' '$(AFTER)' $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can measure
-	$(BIN)/mapless-server bench-network $(ARGS)
+	$(FROM_HERE) $(BIN)/python -m bench.network $(ARGS)
 
 load: setup  ## Measure the server under load; DATA=folder for real photographs, ARGS="--minutes 2" for all's options
 	$(BIN)/mapless-server load all $(if $(DATA),--data '$(DATA)') $(ARGS)
@@ -104,7 +106,7 @@ fuzz: setup  ## Fuzz what reads untrusted input; TARGET="images colmap" for some
 	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --output fuzz-output --runs $(RUNS) --targets $(TARGET) $(ARGS)
 
 load-ray: setup  ## Measure replicas on Ray Serve, on this machine: half an hour; PART=overhead, throughput, failover or redeploys
-	$(BIN)/python -m mapless_tools.load_ray $(or $(PART),all) $(if $(DATA),--data '$(DATA)') $(ARGS)
+	$(FROM_HERE) $(BIN)/python -m bench.load_ray $(or $(PART),all) $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 $(VENV)/.docs: $(VENV)/.installed
 	$(INSTALL) $(LOCKED) --editable '.[docs]'

@@ -26,6 +26,7 @@ from support.parity_rule import (
 from support.parity_rule import full_network as make_full_network
 from torch import Tensor
 
+from bench.network.subject import Work, flop_of
 from mapless_server.networks.checkpoint import load_strictly
 from mapless_server.networks.mapanything import Decoded, MapAnything, as_output, canonical_name
 from mapless_server.networks.view_conditions import (
@@ -38,7 +39,6 @@ from mapless_server.networks.view_conditions import (
     rotations_from_quaternions,
 )
 from mapless_server.networks.weights import CheckpointError
-from mapless_tools.bench_network.subject import Work, flop_of
 
 HERE = Path(__file__).parents[1] / "fixtures" / "networks" / "mapanything"
 BESIDE = Path(os.environ.get("TEST_MAPANYTHING") or Path(__file__).parents[3] / "shared" / "mapanythingparity")

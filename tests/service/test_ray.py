@@ -56,8 +56,8 @@ pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
 
 from support.ray_app import FAILS, HANGS, SECRET
 
-from mapless_tools.load_ray.cluster import Cluster, Replica, application, running_cluster
-from mapless_tools.load_ray.replacing import Calls, Scenes, calling
+from bench.load_ray.cluster import Cluster, Replica, application, running_cluster
+from bench.load_ray.replacing import Calls, Scenes, calling
 
 pytestmark = [pytest.mark.timeout(300), pytest.mark.nightly("ray")]
 

@@ -12,18 +12,18 @@ from support.parity_rule import SMALL_MAPANYTHING, SMALL_PI3, SMALL_PI3X
 from support.small_networks import photograph as photograph_of
 from support.small_networks import references_of, small_runner
 
+from bench.network import command
+from bench.network.command import bench_network
+from bench.network.forward import Forward, max_difference
+from bench.network.planted import UNITS_PER_METRE, PlantedReconstructor, Truth, true_points
+from bench.network.report import Figure
+from bench.network.subject import AnySizes, Work, flop_of, make_network
 from mapless.geometry import Camera
 from mapless_server.choices import NETWORKS
 from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.features.views import Features, Reconstruction, View
 from mapless_tools.bench.turns import Measured, main, ratio_with_interval, report
-from mapless_tools.bench_network import command
-from mapless_tools.bench_network.command import bench_network
-from mapless_tools.bench_network.forward import Forward, max_difference
-from mapless_tools.bench_network.planted import UNITS_PER_METRE, PlantedReconstructor, Truth, true_points
-from mapless_tools.bench_network.report import Figure
-from mapless_tools.bench_network.subject import AnySizes, Work, flop_of, make_network
 
 GRID = (3, 4)
 SIZES = SMALL_PI3

@@ -1,13 +1,9 @@
-"""`mapless-server demo`, `bench` and `bench-network`: what this installation answers, how accurately, and how fast."""
+"""`mapless-server demo` and `bench`: what this installation answers, and how accurately."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from mapless_server.serve.command import fail
-from mapless_server.serve.libraries import configure_libraries
-from mapless_server.settings import ConfigError, load_settings
 
 
 def demo_command(
@@ -35,22 +31,3 @@ def bench_command(
 
     with failures_end_command():
         bench(data, quick)
-
-
-def bench_network_command(
-    quick: Annotated[bool, typer.Option(help="Few repetitions, nothing compiled: to see that it runs.")] = False,
-    only: Annotated[list[str] | None, typer.Option(help="A part to run; again for more; default: all.")] = None,
-    output: Annotated[Path, typer.Option(help="Folder for network.json and network.md.")] = Path("bench-output"),
-) -> None:
-    """Measure the networks beside the least time that their arithmetic takes, and whole queries."""
-    try:
-        configure_libraries(load_settings({}).settings)
-    except ConfigError as error:
-        fail(str(error))
-
-    from mapless_tools.bench_network.command import PARTS, bench_network
-
-    unknown = [part for part in only or () if part not in PARTS]
-    if unknown:
-        fail(f"unknown parts {', '.join(unknown)}; known: {', '.join(PARTS)}")
-    bench_network(quick, only, output)

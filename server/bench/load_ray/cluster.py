@@ -23,6 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from bench.search_path import with_search_path
 from mapless_ray.environment import variables
 
 START_LIMIT_S = 120.0
@@ -143,11 +144,11 @@ def running_cluster(environment: Mapping[str, str] | None = None) -> Iterator[Cl
     folder = Path(tempfile.mkdtemp(prefix="mr-", dir="/tmp"))
     with _bound([0] * 8) as sockets:
         ports = [it.getsockname()[1] for it in sockets]
-    given = os.environ | variables(leaving_s=LEAVING_S) | _own_places(folder, ports) | dict(environment or {})
+    given = os.environ | variables(leaving_s=LEAVING_S) | _own_places(folder, ports) | with_search_path(environment)
     options = {"folder": str(folder / "ray"), "cpus": CPUS, "http_port": ports[0], "grpc_port": ports[1]}
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "mapless_tools.load_ray.host", json.dumps(options)],
+            [sys.executable, "-m", "bench.load_ray.host", json.dumps(options)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,

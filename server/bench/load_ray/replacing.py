@@ -153,7 +153,7 @@ class Scenes:
 
 MAX_GAP_S = 2.0
 """The bar of the longest wait after a kill."""
-NO_OP = "mapless_tools.load_ray.no_op:build"
+NO_OP = "bench.load_ray.no_op:build"
 SETTINGS = {"insecure": True, "workers": 1}
 SETTLE_S = 3.0
 REPLACED_LIMIT_S = 120.0

@@ -1,4 +1,4 @@
-"""`python -m mapless_tools.load_ray overhead|throughput|failover|redeploys|all`: prints tables, writes JSON."""
+"""`python -m bench.load_ray overhead|throughput|failover|redeploys|all`: prints tables, writes JSON."""
 
 import argparse
 import sys
@@ -61,7 +61,7 @@ PARTS: dict[str, Callable[[argparse.Namespace, Progress], Part]] = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the measurements; returns exit code 1 if a check failed or the cluster did not start."""
-    parser = argparse.ArgumentParser(prog="python -m mapless_tools.load_ray", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m bench.load_ray", description=__doc__)
     parser.add_argument("part", choices=[*PARTS, "all"])
     parser.add_argument("--count", type=int, help=f"kills or redeploys; default: {KILLS} and {REDEPLOYS}")
     parser.add_argument("--data", type=Path, help="folder with images/ and cameras.json; default: the demo's room")
@@ -76,7 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 report_part(given.output / "load-ray.json", name, lines, checks, figures)
                 is_met &= all(check.met for check in checks)
     except (ClusterFailed, NoDatabase, ValueError) as error:
-        print(f"mapless_tools.load_ray: {error}", file=sys.stderr)
+        print(f"bench.load_ray: {error}", file=sys.stderr)
         return 1
     return 0 if is_met else 1
 

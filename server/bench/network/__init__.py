@@ -1,7 +1,6 @@
-"""`mapless-server bench-network`: the networks' times, with the least time that their arithmetic needs.
+"""`python -m bench.network`: the networks' times, with the least time that their arithmetic needs.
 
-Weights are random: time does not depend on them. `python -m mapless_tools.bench_network` is the same command without
-the dependencies of the others; all parts except whole queries need only torch and NumPy.
+Weights are random: time does not depend on them. All parts except whole queries need only torch and NumPy.
 
     operations.py    counts operations, and the least time for them
     subject.py       the networks, their weights and their inputs, and what is counted of them
