@@ -99,7 +99,7 @@ bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; wi
 	$(FROM_HERE) $(BIN)/python -m bench.network $(ARGS)
 
 load: setup  ## Measure the server under load; DATA=folder for real photographs, ARGS="--minutes 2" for all's options
-	$(BIN)/mapless-server load all $(if $(DATA),--data '$(DATA)') $(ARGS)
+	$(FROM_HERE) $(BIN)/python -m bench.load all $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 RUNS ?= 1000000
 fuzz: setup  ## Fuzz what reads untrusted input; TARGET="images colmap" for some, RUNS=1000 for few, ARGS="--parallel 2"

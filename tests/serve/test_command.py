@@ -26,7 +26,6 @@ TOOLS = {
     "gateway": [],
     "demo": [],
     "bench": ["folder"],
-    "load": ["overhead"],
 }
 """The commands that need an extra, with the arguments that they must be given."""
 

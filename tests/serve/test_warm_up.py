@@ -27,6 +27,7 @@ from support.servers import (
 )
 from support.waiting import wait_until
 
+from bench.load.driving import free_port
 from mapless.geometry import RigidTransform
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
@@ -47,7 +48,6 @@ from mapless_server.serve.assembly import MakeEngine, StartupError, engine_optio
 from mapless_server.serve.warm_up import ROUNDS, warm_up, warm_up_stronger
 from mapless_server.settings import Settings
 from mapless_server.store import Store
-from mapless_tools.load.driving import free_port
 
 LIMIT_S = 60.0
 TRUTH = np.array([0.25, 0.025, 0.0])

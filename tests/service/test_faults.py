@@ -41,6 +41,8 @@ from support.servers import (
 )
 from support.waiting import wait_until
 
+from bench.load.driving import free_port
+from bench.load.watch import Scrape, read_metrics
 from mapless import (
     AlreadyExists,
     Client,
@@ -57,8 +59,6 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.rpc import receiving, sending
 from mapless_server.serve import running as grpc_server
-from mapless_tools.load.driving import free_port
-from mapless_tools.load.watch import Scrape, read_metrics
 
 ONCE = ConnectOptions(max_attempts=1)
 PATIENT = ConnectOptions(max_attempts=50, initial_backoff_s=1.0, max_backoff_s=2.0)

@@ -31,6 +31,7 @@ from support.postgres import require
 from support.servers import CAMERA, PHOTO, localize_request, serving
 from support.waiting import wait_until
 
+from bench.load.driving import photo_request
 from mapless import (
     Client,
     ConnectOptions,
@@ -50,7 +51,6 @@ from mapless_server.services.handlers import SERVICE_NAMES
 from mapless_server.store import Store
 from mapless_tools.child import child_server
 from mapless_tools.demo import Photograph, Place, split_folder
-from mapless_tools.load.driving import photo_request
 
 pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
 

@@ -13,8 +13,8 @@ from support.clients import Connect, awaiting
 from support.programs import gated
 from support.servers import CAMERA, PHOTO, make_scene, pose, serving
 
+from bench.load.driving import free_port
 from mapless import Client, ConnectOptions, LocalizationResult, MaplessError, NewReference, Unavailable
-from mapless_tools.load.driving import free_port
 
 PATIENT = ConnectOptions(timeout_s=100.0)
 

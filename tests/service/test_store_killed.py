@@ -22,6 +22,7 @@ from support import postgres
 from support.stores import DATABASES, Folder, Place, Shared, faults_of
 from support.waiting import wait_until
 
+from bench.search_path import with_search_path
 from mapless.geometry import Camera, RigidTransform
 from mapless_server import errors
 from mapless_server.method.features.views import Features, View
@@ -130,7 +131,7 @@ class WriterFactory:
 
     def __init__(self, address: str) -> None:
         paths = [str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH", "")]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+        environment = os.environ | with_search_path({"PYTHONPATH": os.pathsep.join(paths)})
         self._process = subprocess.Popen(
             [sys.executable, __file__, address],
             stdin=subprocess.PIPE,

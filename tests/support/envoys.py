@@ -17,8 +17,8 @@ from urllib.request import Request, urlopen
 
 import yaml  # type: ignore[import-untyped]
 
+from bench.load.driving import free_port
 from mapless import ConnectOptions
-from mapless_tools.load.driving import free_port
 from support.certificates import Pair, authority, signed
 from support.waiting import LIMIT_S, wait_until
 

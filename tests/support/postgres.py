@@ -18,7 +18,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from mapless_tools.load.driving import free_port
+from bench.load.driving import free_port
 
 USER = "mapless"
 START_LIMIT_S = 30.0

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from pydantic import SecretStr
 
+from bench.search_path import with_search_path
 from mapless import Client
 from mapless_server.store.sqlite import DATABASE_FILE
 from mapless_tools import child
@@ -67,7 +68,7 @@ def test_a_log_file_has_the_output_of_a_child_that_failed(tmp_path: Path, capfd:
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize("module", [None, pytest.param("mapless_tools.load.no_op", marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("module", [None, pytest.param("bench.load.no_op", marks=pytest.mark.nightly)])
 def test_a_child_on_a_folder_does_not_reach_for_a_database(
     module: str | None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -77,7 +78,11 @@ def test_a_child_on_a_folder_does_not_reach_for_a_database(
     monkeypatch.setenv("MAPLESS_DATABASE_URL", "postgresql://u:secret@127.0.0.1:1/db")
     data_dir = tmp_path / "data"
     data_dir.mkdir()
-    started = child.child_module(module, str(data_dir)) if module else child.child_server(data_dir)
+    started = (
+        child.child_module(module, str(data_dir), environment=with_search_path())
+        if module
+        else child.child_server(data_dir)
+    )
     with started as server, Client(server.address) as client:
         client.create_scene("mine")
         assert (data_dir / DATABASE_FILE).is_file()
@@ -87,11 +92,15 @@ def test_a_child_on_a_folder_does_not_reach_for_a_database(
 def test_a_server_ends_with_a_tool_that_is_killed(tmp_path: Path) -> None:
     program = (
         "import os, signal, sys; from mapless_tools.child import child_module\n"
-        "with child_module('mapless_tools.load.no_op', sys.argv[1]) as server:\n"
+        "with child_module('bench.load.no_op', sys.argv[1]) as server:\n"
         "    print(server.process_id, flush=True); os.kill(os.getpid(), signal.SIGKILL)"
     )
     tool = subprocess.run(
-        [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True, check=False
+        [sys.executable, "-c", program, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=False,
+        env=os.environ | with_search_path(),
     )
     assert tool.returncode == -signal.SIGKILL
     state = Path(f"/proc/{int(tool.stdout)}/stat")

@@ -20,8 +20,7 @@ from grpc_status import rpc_status
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapless_server.images import ImageLimits, decode_image
-from mapless_tools.load.calls import (
+from bench.load.calls import (
     REGULAR_JITTER,
     CallRecord,
     Fate,
@@ -35,19 +34,20 @@ from mapless_tools.load.calls import (
     poisson_times,
     regular_times,
 )
-from mapless_tools.load.charts import LATENCIES, RATES, draw_load
-from mapless_tools.load.no_op import CAMERA, padded_photo
-from mapless_tools.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
-from mapless_tools.load.report import check_lines, report_part, step_lines
-from mapless_tools.load.sender import Target, connected, send_closed_loop, send_open_loop
-from mapless_tools.load.step import Step, run_step
-from mapless_tools.load.watch import (
+from bench.load.charts import LATENCIES, RATES, draw_load
+from bench.load.no_op import CAMERA, padded_photo
+from bench.load.pipeline import PipelineOptions, PipelineResult, pipeline_checks, pipeline_json
+from bench.load.report import check_lines, report_part, step_lines
+from bench.load.sender import Target, connected, send_closed_loop, send_open_loop
+from bench.load.step import Step, run_step
+from bench.load.watch import (
     ProcessSample,
     Scrape,
     ServerUnderLoad,
     parse_metrics,
     reconcile,
 )
+from mapless_server.images import ImageLimits, decode_image
 
 METHOD = "/toy.Toy/Call"
 GOOD, BAD = b"good", b"bad"
@@ -434,7 +434,7 @@ def test_the_report_has_every_figure_and_keeps_earlier_parts(tmp_path: Path) -> 
 
 async def test_a_step_uses_the_servers_account_of_its_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
     pages = iter([Scrape(10, {"OK": 10}, {}, {}), Scrape(13, {"OK": 13}, {}, {})])
-    monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: next(pages))
+    monkeypatch.setattr("bench.load.watch.read_metrics", lambda _: next(pages))
 
     async def send() -> list[CallRecord]:
         await asyncio.sleep(0.05)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.load.slopes import MIN_SAMPLES, Slope, slope
+from bench.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
+from bench.load.watch import Scrape, ServerState, ServerUnderLoad, read_state
 from mapless.geometry import Array
-from mapless_tools.load.slopes import MIN_SAMPLES, Slope, slope
-from mapless_tools.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
-from mapless_tools.load.watch import Scrape, ServerState, ServerUnderLoad, read_state
 
 EVERY_S = 10.0
 TIMES_S = np.arange(0.0, 2400.0, EVERY_S)
@@ -111,7 +111,7 @@ def test_a_process_is_read_with_its_files_sockets_and_folder(tmp_path: Path, mon
         Scrape(0, {}, {}, {}, {"mapless_event_loop_lag_seconds_sum": s, "mapless_event_loop_lag_seconds_count": n})
         for s, n in ((1.0, 100.0), (1.5, 200.0))
     ]
-    monkeypatch.setattr("mapless_tools.load.watch.read_metrics", lambda _: pages.pop(0))
+    monkeypatch.setattr("bench.load.watch.read_metrics", lambda _: pages.pop(0))
     (tmp_path / "below").mkdir()
     (tmp_path / "below" / "file").write_bytes(bytes(2**20))
     watched = ServerUnderLoad(os.getpid(), "nowhere", tmp_path)

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from bench.load.overhead import overhead_figures, overhead_lines
+from bench.load.report import Check, report_part
 from mapless_server.serve.signals import terminable
 from mapless_tools.demo import place_of
-from mapless_tools.load.overhead import overhead_figures, overhead_lines
-from mapless_tools.load.report import Check, report_part
 from mapless_tools.progress import Progress, progress_bars
 
 from .cluster import ClusterFailed

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from bench.load.driving import free_port
 from mapless_server.settings import PREFIX
-from mapless_tools.load.driving import free_port
 
 VARIABLE = f"{PREFIX}DATABASE_URL"
 START_LIMIT_S = 30.0

@@ -4,9 +4,9 @@ from typing import Any
 
 from ray.serve import Application
 
+from bench.load.no_op import make_no_op_engine
 from mapless_ray.app import deployed
 from mapless_ray.replica import MaplessReplica
-from mapless_tools.load.no_op import make_no_op_engine
 
 
 class NoOpReplica(MaplessReplica):

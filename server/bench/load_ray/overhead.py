@@ -3,13 +3,14 @@
 import asyncio
 from statistics import median
 
+from bench.load import no_op
+from bench.load.driving import SCENE, photo_request
+from bench.load.overhead import Called, OverheadOptions, Subject, compare_by_turns
+from bench.load.report import Check
+from bench.search_path import with_search_path
 from mapless import Client
 from mapless_server.settings import PREFIX
 from mapless_tools.child import child_module
-from mapless_tools.load import no_op
-from mapless_tools.load.driving import SCENE, photo_request
-from mapless_tools.load.overhead import Called, OverheadOptions, Subject, compare_by_turns
-from mapless_tools.load.report import Check
 from mapless_tools.progress import Progress
 
 from .cluster import application, running_cluster
@@ -32,8 +33,8 @@ def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subje
     request = photo_request(photo, no_op.CAMERA, names)
     with database_url() as url, running_cluster({VARIABLE: url}) as cluster:
         cluster.deploy(application({"insecure": True, "workers": WORKERS}, 1, import_path=NO_OP))
-        environment = {VARIABLE: url, f"{PREFIX}WORKERS": str(WORKERS)}
-        with child_module("mapless_tools.load.no_op", environment=environment) as plain:
+        environment = with_search_path({VARIABLE: url, f"{PREFIX}WORKERS": str(WORKERS)})
+        with child_module("bench.load.no_op", environment=environment) as plain:
             with Client(cluster.address) as client:
                 client.create_scene(SCENE)
                 client.add_references(SCENE, [Scenes(photo=photo).reference(name) for name in names])

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
+from bench.load.no_op import CAMERA, padded_photo
+from bench.load.report import Check
 from mapless import Client, ConnectOptions, MaplessError, NewReference, RigidTransform
 from mapless.geometry import Camera
-from mapless_tools.load.no_op import CAMERA, padded_photo
-from mapless_tools.load.report import Check
 from mapless_tools.output_files import markdown_table
 from mapless_tools.progress import Progress
 

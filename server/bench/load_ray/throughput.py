@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
+from bench.load.calls import Fate
+from bench.load.driving import METHOD, read_answer, requests_for, store_references
+from bench.load.report import Check
+from bench.load.sender import Target, connected
+from bench.load.step import Step, closed_loop_step
+from bench.load.watch import ServerUnderLoad, read_process
 from mapless import Client
 from mapless_tools.demo import Place
-from mapless_tools.load.calls import Fate
-from mapless_tools.load.driving import METHOD, read_answer, requests_for, store_references
-from mapless_tools.load.report import Check
-from mapless_tools.load.sender import Target, connected
-from mapless_tools.load.step import Step, closed_loop_step
-from mapless_tools.load.watch import ServerUnderLoad, read_process
 from mapless_tools.output_files import markdown_table
 from mapless_tools.progress import Progress, tracked
 

@@ -15,7 +15,6 @@ from mapless_tools.calibrate.command import calibrate_command
 from mapless_tools.evaluate.cli import evaluate_command
 from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
-from mapless_tools.load.command import load_app
 from mapless_tools.replay.command import replay_bag_command, replay_command
 from mapless_tools.view.command import view_command
 
@@ -90,4 +89,3 @@ _add_tool("view", view_command, extra="view")
 _add_tool("gateway", gateway_command, extra="gateway")
 _add_tool("demo", demo_command)
 _add_tool("bench", bench_command)
-app.add_typer(load_app, name="load", callback=lambda: _require("tools", "load"))

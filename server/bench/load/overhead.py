@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
+from bench.search_path import with_search_path
 from mapless import Client, RigidTransform
 from mapless_server.bounds import check_bounds
 from mapless_tools.child import ChildServer, child_module
@@ -97,8 +98,8 @@ def measure_overhead(options: OverheadOptions, progress: Progress) -> list[Subje
     """Starts the bare server and the one that computes nothing, and calls them by turns."""
     with ExitStack() as stack:
         data_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="mapless-load-"))
-        bare = stack.enter_context(child_module("mapless_tools.load.echo"))
-        ours = stack.enter_context(child_module("mapless_tools.load.no_op", data_dir))
+        bare = stack.enter_context(child_module("bench.load.echo", environment=with_search_path()))
+        ours = stack.enter_context(child_module("bench.load.no_op", data_dir, environment=with_search_path()))
         places = {
             BARE: Called(bare.address, bare.process_id, SHORT_METHOD, ""),
             ECHO: Called(bare.address, bare.process_id, ECHO_METHOD, ""),

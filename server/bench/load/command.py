@@ -1,4 +1,4 @@
-"""`mapless-server load ...`: arguments in; tables, a picture and JSON out."""
+"""`python -m bench.load ...`: arguments in; tables, a picture and JSON out."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ load_app = typer.Typer(
     help="Measure what the server does under load. Figures go to load-output/load.json, pictures beside it: load.png "
     "of the pipeline, soak.svg of the soak; and the server's log.",
     no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_show_locals=False,  # which would print image bytes
 )
 
 Data = Annotated[Path | None, typer.Option(help="Folder with images/ and cameras.json; default: mapless's own room.")]
