@@ -90,10 +90,10 @@ demo: setup  ## Localize photographs end to end; DATA=folder for real ones
 # The programs that measure are not installed.
 FROM_HERE := PYTHONPATH=client:server
 bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder with the scenes
-	$(BIN)/mapless-server bench $(if $(DATA),'$(DATA)',../shared/data)
+	$(FROM_HERE) $(BIN)/python -m bench $(if $(DATA),'$(DATA)',../shared/data)
 
 bench-turns: setup  ## Compare what a query costs two commits, by turns in one run: BEFORE=commit AFTER=commit (or the working tree)
-	$(BIN)/python -m mapless_tools.bench.turns '$(BEFORE)' '$(AFTER)' $(if $(DATA),--data '$(DATA)') $(ARGS)
+	$(FROM_HERE) $(BIN)/python -m bench.turns '$(BEFORE)' '$(AFTER)' $(if $(DATA),--data '$(DATA)') $(ARGS)
 
 bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can measure
 	$(FROM_HERE) $(BIN)/python -m bench.network $(ARGS)

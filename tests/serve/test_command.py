@@ -25,7 +25,6 @@ TOOLS = {
     "view": ["scene"],
     "gateway": [],
     "demo": [],
-    "bench": ["folder"],
 }
 """The commands that need an extra, with the arguments that they must be given."""
 

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 from support.commands import refusal, run
 from support.layouts import write_cambridge, write_cameras, write_seven_scenes, write_twelve_scenes
 from support.wall import wall
 
+from bench.__main__ import main as bench
 from mapless.geometry import Camera
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
@@ -105,8 +107,12 @@ def children_of(process_id: int) -> list[int]:
     return [int(child) for task in tasks for child in (task / "children").read_text().split()]
 
 
-def test_bench_without_scenes_is_one_line(tmp_path: Path) -> None:
-    assert "holds none of the scenes" in refusal("bench", tmp_path)
+def test_bench_without_scenes_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as ended:
+        bench(tmp_path)
+    assert ended.value.exit_code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "holds none of the scenes" in line
 
 
 KINECT = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)

@@ -18,12 +18,12 @@ from bench.network.forward import Forward, max_difference
 from bench.network.planted import UNITS_PER_METRE, PlantedReconstructor, Truth, true_points
 from bench.network.report import Figure
 from bench.network.subject import AnySizes, Work, flop_of, make_network
+from bench.turns import Measured, main, ratio_with_interval, report
 from mapless.geometry import Camera
 from mapless_server.choices import NETWORKS
 from mapless_server.method.coarse import reconstruct_one
 from mapless_server.method.coarse.network import NetworkReconstructor
 from mapless_server.method.features.views import Features, Reconstruction, View
-from mapless_tools.bench.turns import Measured, main, ratio_with_interval, report
 
 GRID = (3, 4)
 SIZES = SMALL_PI3

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from rich.console import Console
 from support.evaluations import evaluation, query_result
 
+from bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
 from mapless import IntrinsicsCheck
 from mapless.geometry import RigidTransform, rotation_from_vector
-from mapless_tools.bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
 from mapless_tools.charts import INK, figure_of, inline_svg, new_axes, plot, use_logarithms
 from mapless_tools.child import Memory
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, summarize

@@ -19,7 +19,7 @@ from mapless_tools.replay.command import replay_bag_command, replay_command
 from mapless_tools.view.command import view_command
 
 from .audit import audit_command
-from .measure import bench_command, demo_command
+from .demo import demo_command
 from .store import store_app
 from .tokens import token_app
 from .weights import weights_app
@@ -88,4 +88,3 @@ _add_tool("replay-bag", replay_bag_command)
 _add_tool("view", view_command, extra="view")
 _add_tool("gateway", gateway_command, extra="gateway")
 _add_tool("demo", demo_command)
-_add_tool("bench", bench_command)

@@ -1,4 +1,4 @@
-"""Two commits compared in one run, by turns: `python -m mapless_tools.bench.turns BEFORE [AFTER] --data FOLDER`.
+"""Two commits compared in one run, by turns: `python -m bench.turns BEFORE [AFTER] --data FOLDER`.
 
 Times of two runs differ by more than a change of the code does, so a server of each commit is measured at the same
 time: both have the same references, and localize each photograph one after the other, in the order A B B A. What is

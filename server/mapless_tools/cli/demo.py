@@ -1,4 +1,4 @@
-"""`mapless-server demo` and `bench`: what this installation answers, and how accurately."""
+"""`mapless-server demo`: what this installation answers."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,15 +19,3 @@ def demo_command(
     with failures_end_command(ValueError):
         went_well = run_demo(data, output)
     raise typer.Exit(0 if went_well else 1)
-
-
-def bench_command(
-    data: Annotated[Path, typer.Argument(help="Folder of the scenes' folders.")],
-    quick: Annotated[bool, typer.Option(help="A few queries a scene: to see that it runs.")] = False,
-) -> None:
-    """Measure all scenes against their targets, and latency and memory; writes bench-output/bench.json."""
-    from mapless_tools.bench import bench
-    from mapless_tools.usage import failures_end_command
-
-    with failures_end_command():
-        bench(data, quick)
