@@ -21,6 +21,7 @@ MAX_TEXT = 128
 """Characters of each text of a calibration."""
 
 FACTORS = ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95")
+NOISES = ("reference_noise_m", "reference_noise_deg")
 TEXTS = ("features", "backend", "server_version")
 _VARIANT: wire.ProtoEnum = localization_pb.Variant
 
@@ -44,7 +45,9 @@ class Calibration:
     """Measured factors of the radii of answers in a scene, from photographs with known poses.
 
     The radii of answers are multiplied by the factors, so that they contain the truth as often as they state. Answers
-    of another method or server version than measured remain uncalibrated.
+    of another method or server version than measured remain uncalibrated. The factor of 68 % is first combined with the
+    errors of the references' poses, as the hypotenuse of factor and error / radius; that of 95 % stays in the same
+    ratio to it.
 
     Attributes:
         position_factor_68, position_factor_95: factors of the position's radii at 68 and 95 %, 0.01 to 1000.
@@ -53,6 +56,9 @@ class Calibration:
         features, backend, variant: method of their answers, as in `Diagnostics` ("BEST").
         server_version: version of the measured server.
         create_time: time of storing, by the server's clock; None before.
+        reference_noise_m, reference_noise_deg: errors of the references' own poses, not exceeded in 68 % of cases.
+        grows_with_gap: whether the factors hold where the nearest reference is at a tenth of the distance to what the
+            photograph shows, and grow with the power 0.2 of that share; otherwise they hold anywhere.
     """
 
     position_factor_68: float
@@ -65,12 +71,18 @@ class Calibration:
     variant: str
     server_version: str
     create_time: datetime | None = None
+    reference_noise_m: float = 0.0
+    reference_noise_deg: float = 0.0
+    grows_with_gap: bool = False
 
     def __post_init__(self) -> None:
         for name in FACTORS:
             factor = getattr(self, name)
             if not MIN_FACTOR <= factor <= MAX_FACTOR:
                 raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {factor:g}")
+        for name in NOISES:
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be at least 0 and finite, is {getattr(self, name):g}")
         if self.query_count < 1:
             raise ValueError(f"query_count must be at least 1, is {self.query_count}")
         for name in (*TEXTS, "variant"):
@@ -128,7 +140,8 @@ def calibration_to_message(calibration: Calibration) -> pb.SceneCalibration:
     """Message of a calibration; an unknown variant becomes unspecified."""
     numbers = dict(_VARIANT.items())
     message = pb.SceneCalibration(
-        **{name: getattr(calibration, name) for name in FACTORS + TEXTS},
+        **{name: getattr(calibration, name) for name in FACTORS + NOISES + TEXTS},
+        grows_with_gap=calibration.grows_with_gap,
         query_count=calibration.query_count,
         variant=numbers.get(wire.enum_prefix(_VARIANT) + calibration.variant, 0),
     )
@@ -144,7 +157,7 @@ def calibration_from_message(message: pb.SceneCalibration, field: str) -> Calibr
     """
     try:
         return Calibration(
-            **{name: getattr(message, name) for name in (*FACTORS, *TEXTS, "query_count")},
+            **{name: getattr(message, name) for name in (*FACTORS, *NOISES, *TEXTS, "query_count", "grows_with_gap")},
             variant=wire.value_name(_VARIANT.DESCRIPTOR, message.variant),
             create_time=message.create_time.ToDatetime(timezone.utc) if message.HasField("create_time") else None,
         )

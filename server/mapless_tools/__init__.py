@@ -5,7 +5,6 @@ evaluate/       accuracy on benchmarks, as in the paper
 bench/          accuracy and latency of a version, against targets
 bench_network/  the networks' speed
 load/           load, soak
-calibrate/      radii of a scene, measured
 ingest/         import and export; formats/ reads what other programs write
 replay/         captured calls computed again
 view/           the viewer in the browser

@@ -123,7 +123,7 @@ def test_a_server_without_tools_names_their_extra(install: Callable[[str], Path]
 def test_tools_run_with_their_extra(install: Callable[[str], Path], wheel: Path, tmp_path: Path) -> None:
     programs = install("[server,tools]")
     server = programs / "mapless-server"
-    for name in ("import", "export", "audit", "evaluate", "calibrate", "replay", "demo"):
+    for name in ("import", "export", "audit", "evaluate", "replay", "demo"):
         run(server, name, "--help")
     assert "is not a folder" in run(server, "import", tmp_path / "absent", "scene", code=2)
     message = run(server, "view", "scene", code=2)

@@ -234,6 +234,9 @@ def seeds() -> tuple[bytes, ...]:
     )
     calibration = pb.SceneCalibration(
         **factors,
+        reference_noise_m=0.01,
+        reference_noise_deg=0.1,
+        grows_with_gap=True,
         query_count=9,
         features="sift",
         backend="geometric",

@@ -18,7 +18,6 @@ TOOLS = {
     "import": ["folder", "scene"],
     "export": ["scene", "folder"],
     "audit": ["scene"],
-    "calibrate": ["folder"],
     "evaluate": ["folder"],
     "replay": ["folder"],
     "replay-bag": ["recording", "scene", "out"],

@@ -32,7 +32,12 @@ from mapless_server.security import key_of
 from mapless_server.store import SceneAttributes, SelfCalibration, Store
 
 DATUM = Datum(47.5, 8.25, 400.0, enu_from_y_up(0))
-CALIBRATION = Calibration(1.5, 1.25, 2.0, 1.75, 40, "sift-2048", "geometric", "BEST", "0.1.0")
+CALIBRATION = Calibration(
+    *(1.5, 1.25, 2.0, 1.75, 40, "sift-2048", "geometric", "BEST", "0.1.0"),
+    reference_noise_m=0.01,
+    reference_noise_deg=0.1,
+    grows_with_gap=True,
+)
 
 
 def test_a_scene_is_created_with_what_is_known_of_it(client: Client) -> None:
@@ -117,6 +122,8 @@ BAD: list[tuple[str, Any] | tuple[str, Any, str]] = [
     ("calibration.rotation_factor_68", 1001),
     ("calibration.rotation_factor_95", -1),
     ("calibration.query_count", 0),
+    ("calibration.reference_noise_m", -1),
+    ("calibration.reference_noise_deg", INFINITY),
     ("calibration.backend", "x" * 129),
 ]
 

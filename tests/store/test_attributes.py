@@ -189,6 +189,8 @@ quaternion = vector.map(lambda it: Quaternion.from_matrix(rotation_from_vector(i
         st.integers(1, 2**31 - 1),
         *[st.text(max_size=20)] * 4,
         st.none() | st.datetimes(timezones=st.just(timezone.utc)),
+        *[st.floats(0, 1e6)] * 2,
+        st.booleans(),
     ),
 )
 def test_every_bit_comes_back(datum: Datum | None, calibration: Calibration | None) -> None:

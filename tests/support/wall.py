@@ -15,8 +15,8 @@ BOARDS_M = ((5.0, 9.0, 7.0), (3.6, 1.6, 1.1))
 Shot = tuple[NDArray[np.uint8], RigidTransform]
 
 
-def wall(camera: Camera, count: int = 9) -> list[Shot]:
-    """Photographs (H, W, 3) 0.35 m apart and their poses, world from camera."""
+def wall(camera: Camera, count: int = 9, step_m: float = 0.35) -> list[Shot]:
+    """Photographs (H, W, 3) one step apart and their poses, world from camera."""
     random = random_for("wall")
     boards = [
         textured(round(width_m * PIXELS_PER_METRE), round(height_m * PIXELS_PER_METRE), seed=i)
@@ -25,7 +25,7 @@ def wall(camera: Camera, count: int = 9) -> list[Shot]:
     shots = []
     for i in range(count):
         rotation = rotation_from_vector(random.normal(0, 0.05, 3))
-        centre = np.array([0.35 * (i - count // 2), random.normal(0, 0.1), random.normal(0, 0.1)])
+        centre = np.array([step_m * (i - count // 2), random.normal(0, 0.1), random.normal(0, 0.1)])
         pose = RigidTransform(rotation, centre)
         shots.append((photograph(boards, camera, pose), pose))
     return shots

@@ -16,12 +16,17 @@ from support.evaluations import evaluation, query_result
 from bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
 from mapless import IntrinsicsCheck
 from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless_server.method.bundle.estimate import USUAL_GAP, Accuracy
+from mapless_server.scenes.calibration.fit import FitOptions, LeftOut
+from mapless_server.services.messages.radii import Conditions
 from mapless_tools.charts import INK, figure_of, inline_svg, new_axes, plot, use_logarithms
 from mapless_tools.child import Memory
+from mapless_tools.evaluate.calibrate import fit_calibration
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, summarize
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
 from mapless_tools.evaluate.report import print_report, to_json
 from mapless_tools.evaluate.run import Evaluation
+from mapless_tools.usage import UsageError
 
 
 def result(translation: float, rotation_deg: float = 0.01, latency_ms: float = 100.0) -> QueryResult:
@@ -219,6 +224,29 @@ class TestBench:
         content = json.loads(json.dumps(as_json(measured), allow_nan=False))
         assert content["scenes"][0]["target_met"] is True
         assert content["latency"]["warm_p50_ms"] == 200.0
+
+
+class TestCalibrate:
+    def measured(self, count: int, times: float, features: str = "sift") -> list[tuple[Conditions, LeftOut]]:
+        """Right answers whose errors are so many times what the model expects."""
+        off, claimed = times * FitOptions().median_ratio, Accuracy(0.005, 0.01, 0.1, 0.2)
+        one = LeftOut(0.005 * off, 0.1 * off, claimed, 0.5, USUAL_GAP, 50.0)
+        return [(Conditions(features, "geometric", "BEST", "1"), one)] * count
+
+    def test_the_features_of_most_answers_are_calibrated(self) -> None:
+        found = fit_calibration([*self.measured(40, 3.0), *self.measured(15, 1.0, "aliked")])
+        assert (found.calibration.features, found.calibration.query_count) == ("sift", 40)
+        assert found.calibration.position_factor_68 == pytest.approx(3.0, rel=0.15)
+        assert found.positions_held == found.rotations_held == 1.0
+
+    @pytest.mark.parametrize(("count", "times", "words"), [(9, 1.0, "9 photographs are"), (40, 60.0, "too large for")])
+    def test_few_or_inexplicable_answers_are_refused(self, count: int, times: float, words: str) -> None:
+        with pytest.raises(UsageError, match=f"nothing is stored: .*{words}"):
+            fit_calibration(self.measured(count, times))
+
+    def test_without_answers_nothing_is_stored(self) -> None:
+        with pytest.raises(UsageError, match="nothing is stored: 0 photographs"):
+            fit_calibration([])
 
 
 def test_a_failure_is_a_cross_and_breaks_the_curve() -> None:

@@ -75,7 +75,7 @@ class Datum(_message.Message):
     def __init__(self, latitude_deg: _Optional[float] = ..., longitude_deg: _Optional[float] = ..., height_m: _Optional[float] = ..., enu_from_world: _Optional[_Union[_geometry_pb2.Quaternion, _Mapping]] = ...) -> None: ...
 
 class SceneCalibration(_message.Message):
-    __slots__ = ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95", "query_count", "features", "backend", "variant", "server_version", "create_time")
+    __slots__ = ("position_factor_68", "position_factor_95", "rotation_factor_68", "rotation_factor_95", "query_count", "features", "backend", "variant", "server_version", "create_time", "reference_noise_m", "reference_noise_deg", "grows_with_gap")
     POSITION_FACTOR_68_FIELD_NUMBER: _ClassVar[int]
     POSITION_FACTOR_95_FIELD_NUMBER: _ClassVar[int]
     ROTATION_FACTOR_68_FIELD_NUMBER: _ClassVar[int]
@@ -86,6 +86,9 @@ class SceneCalibration(_message.Message):
     VARIANT_FIELD_NUMBER: _ClassVar[int]
     SERVER_VERSION_FIELD_NUMBER: _ClassVar[int]
     CREATE_TIME_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_NOISE_M_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_NOISE_DEG_FIELD_NUMBER: _ClassVar[int]
+    GROWS_WITH_GAP_FIELD_NUMBER: _ClassVar[int]
     position_factor_68: float
     position_factor_95: float
     rotation_factor_68: float
@@ -96,7 +99,10 @@ class SceneCalibration(_message.Message):
     variant: _localization_service_pb2.Variant
     server_version: str
     create_time: _timestamp_pb2.Timestamp
-    def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
+    reference_noise_m: float
+    reference_noise_deg: float
+    grows_with_gap: bool
+    def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., reference_noise_m: _Optional[float] = ..., reference_noise_deg: _Optional[float] = ..., grows_with_gap: bool = ...) -> None: ...
 
 class Reference(_message.Message):
     __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256")

@@ -11,7 +11,6 @@ from mapless_command.installation import how_to_install
 from mapless_server import __version__
 from mapless_server.extras import missing_package
 from mapless_server.serve.command import fail, serve_command
-from mapless_tools.calibrate.command import calibrate_command
 from mapless_tools.evaluate.cli import evaluate_command
 from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
@@ -81,7 +80,6 @@ app.add_typer(weights_app, name="weights")
 _add_tool("import", import_command, cls=ImportCommand)
 _add_tool("export", export_command)
 _add_tool("audit", audit_command)
-_add_tool("calibrate", calibrate_command)
 _add_tool("evaluate", evaluate_command)
 _add_tool("replay", replay_command)
 _add_tool("replay-bag", replay_bag_command)

@@ -5,9 +5,13 @@ from typing import Annotated, Any
 
 import typer
 
+from mapless_tools.connection import Connection, with_flags
+from mapless_tools.ingest.command import FORMAT_NAMES
+
 OUTPUT = Path("evaluation-output")
 
 
+@with_flags
 def evaluate_command(
     folder: Annotated[
         Path,
@@ -17,7 +21,11 @@ def evaluate_command(
         ),
     ],
     layout: Annotated[
-        str, typer.Option(help="How it lies on the disk: auto, 7scenes, 12scenes, cambridge or cameras.")
+        str,
+        typer.Option(
+            help="How it lies on the disk: auto, 7scenes, 12scenes, cambridge or cameras; with --calibrate also "
+            f"another one of {FORMAT_NAMES}."
+        ),
     ] = "auto",
     protocol: Annotated[
         str | None, typer.Option(help="dense, sparse or both: dense,sparse. Default: both, for benchmarks.")
@@ -75,16 +83,45 @@ def evaluate_command(
         int | None, typer.Option(help="cameras.json: queries; default: 40, or every frame when one is left out.")
     ] = None,
     json: Annotated[Path | None, typer.Option(help="cameras.json: file to write the figures to.")] = None,
+    calibrate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SCENE",
+            help="Id of a stored scene, in whose world the folder's poses are: its answers are measured, and the "
+            "factors of their radii are stored with it.",
+        ),
+    ] = None,
+    *,
+    connection: Connection,
 ) -> None:
     """Measure accuracy and latency on photographs with known poses, through a server of its own.
 
     Benchmarks are measured as in the paper, dense and sparse, with its figures beside; a long evaluation that is
     interrupted goes on where it ended. A folder with cameras.json is measured by leaving one out, or with --references,
     unless --protocol or --output asks for the same report.
+
+    With --calibrate the server is the one at --address, or is started on the store of the settings; the photographs
+    are localized in a scene that is there, which has none of them, and its answers are calibrated from then on. Only
+    --layout, --variant, --k, --queries and --json go with it.
     """
     from mapless_tools.usage import failures_end_command
 
     with failures_end_command():
+        if calibrate is not None:
+            others: dict[str, object] = {
+                "protocol": protocol,
+                "sparse": sparse,
+                "max_queries": max_queries,
+                "pairs": pairs,
+            }
+            others |= {"ground_truth": ground_truth, "output": output, "partial": partial, "references": references}
+            others |= {"scales": scales != "two_stage", "stride": stride != 1, "choose": choose != "retrieval"}
+            _refuse("without --calibrate", **others, worst=worst != 4)
+            from .command import calibrate_scene
+
+            calibrate_scene(folder, layout, calibrate, connection, json, query_count=queries, k=k, variant=variants)
+            return
+        _refuse("with --calibrate", **vars(connection))
         if _is_own_folder(folder, layout) and protocol is None and output is None:
             benchmarks = {"sparse": sparse, "max_queries": max_queries, "pairs": pairs, "ground_truth": ground_truth}
             _refuse("with --protocol or --output", **benchmarks, partial=partial)
@@ -126,7 +163,7 @@ def _is_own_folder(folder: Path, layout: str) -> bool:
 def _refuse(only: str, **flags: object) -> None:
     from mapless_tools.usage import UsageError
 
-    given = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value not in (None, False)]
+    given = [f"--{name.replace('_', '-')}" for name, value in flags.items() if value not in (None, False, "")]
     if given:
         raise UsageError(f"{', '.join(given)}: only {only}")
 

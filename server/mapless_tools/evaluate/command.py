@@ -1,13 +1,17 @@
 """`mapless-server evaluate`: everything is checked first, then measured, then reported."""
 
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from mapless.names import check_id
+from mapless_server.serve.assembly import image_limits
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import load_settings
+from mapless_tools.connection import Connection, connected
 from mapless_tools.ingest.formats import ReadOptions, read_dataset
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.output_files import check_writable, write_json
@@ -15,6 +19,7 @@ from mapless_tools.progress import progress_bars
 from mapless_tools.usage import UsageError, usage_errors
 
 from .benchmarks import ScenePlace, find_scenes
+from .calibrate import fit_calibration, measure_scene, photographs
 from .plan import EvaluationOptions, SuiteOptions, split_scene
 from .references import Matcher, check_images, paired, pairs_file, read_pairs
 from .report import print_report, to_json
@@ -43,6 +48,35 @@ def evaluate_folder(folder: Path, json_file: Path | None, **options: Any) -> Non
     print_report(evaluation, Console())
     if json_file is not None:
         write_json(json_file, to_json(evaluation))
+
+
+def calibrate_scene(
+    folder: Path, layout: str, scene_id: str, connection: Connection, json_file: Path | None, **options: Any
+) -> None:
+    """Measures a stored scene on a folder's photographs, prints the table, and stores the factors of its radii.
+
+    `options` are those of EvaluationOptions. UsageError for a wrong folder, option, file, setting or scene, or if too
+    few photographs are localized.
+    """
+    with usage_errors():
+        checked = EvaluationOptions(**options)
+        check_id(scene_id)
+        settings = load_settings({}).settings
+        dataset = read_dataset(folder, layout)
+        frames = photographs(dataset, checked, image_limits(settings))
+        if json_file is not None:
+            check_writable(json_file)
+    with terminable(), ExitStack() as stack:
+        with usage_errors():
+            client = stack.enter_context(connected(connection, settings))
+        with progress_bars() as progress:
+            evaluation, measured = measure_scene(client, scene_id, dataset, frames, checked, progress)
+        print_report(evaluation, Console())
+        if json_file is not None:
+            write_json(json_file, to_json(evaluation))
+        found = fit_calibration(measured)
+        client.update_scene(scene_id, calibration=found.calibration)
+    print(f"stored with scene {scene_id}, {found}")
 
 
 def evaluate_benchmarks(

@@ -16,10 +16,14 @@ from .metrics import QueryResult, Summary, summarize
 from .run import Evaluation
 from .rungs import RIGHT_DEG, RIGHT_M, RIGHT_SHARE, Rung, largest_error, rungs_of, wrong_count
 
+CHOICE_RULES = {
+    False: f"References of a query: those with the most feature matches; within {APART_M:g} m of one chosen "
+    f"before, matches count {NEARBY_WEIGHT:g}. Its true pose is not looked at.",
+    True: "References of a query: those that the server chooses. Radii are those without the scene's calibration.",
+}
+"""How references are chosen, by whether a stored scene was measured."""
 RULES = (
     "Medians, p90 and recall are over all queries; one that was rejected counts as infinitely wrong.",
-    f"References of a query: those with the most feature matches; within {APART_M:g} m of one chosen "
-    f"before, matches count {NEARBY_WEIGHT:g}. Its true pose is not looked at.",
     "Latency: time of one Localize call as the client sees it, one after the other, on this machine; choosing the "
     "references is not in it, nor is the first call in p50 and p95.",
     f"A localized query is wrong that is off by more than {RIGHT_M:g} m or {RIGHT_DEG:g} degrees; where the unit is "
@@ -40,7 +44,8 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         "scene": dataset.name,
         "metric": metric,
         "ground_truth": dataset.source,
-        "split": "leave_one_out" if options.reference_count is None else "references_and_queries",
+        "stored_scene": evaluation.scene_id or None,
+        "split": _split(evaluation),
         "references": evaluation.reference_count,
         "k": options.k,
         "variant": options.variant,
@@ -67,7 +72,7 @@ def to_json(evaluation: Evaluation) -> dict[str, Any]:
         "stage_share": dict(summary.stage_share),
         "rejections": dict(summary.rejections),
         "rungs": [asdict(it) for it in rungs_of(evaluation.results, _largest_error(evaluation))],
-        "rules": [*RULES] if metric else [*RULES, SCALE_FREE],
+        "rules": list(_rules(evaluation)),
         "per_query": [_query(result, metric) for result in evaluation.results],
     }
 
@@ -76,7 +81,9 @@ def print_report(evaluation: Evaluation, console: Console) -> None:
     """Prints the table, what was rejected, and the rules of the figures."""
     dataset, options = evaluation.dataset, evaluation.options
     summary = summarize(evaluation.results)
-    split = "leave one out" if options.reference_count is None else f"{evaluation.reference_count} references"
+    split = "leave one out" if _split(evaluation) == "leave_one_out" else f"{evaluation.reference_count} references"
+    if evaluation.scene_id:
+        split = f"scene {evaluation.scene_id}, {split}"
     table = Table("", "", title=f"{dataset.name}: {split}, K = {options.k}", show_header=False, title_justify="left")
     for name, value in {
         "localized": f"{summary.localized_count} of {summary.query_count}, "
@@ -98,7 +105,7 @@ def print_report(evaluation: Evaluation, console: Console) -> None:
         console.print(_rungs_table(rungs), highlight=False, markup=False)
     for rejected in (r for r in evaluation.results if not r.localized):
         console.print(f"  {rejected.name}: {rejected.rejection}: {rejected.message}", highlight=False, markup=False)
-    for rule in RULES if dataset.metric else (*RULES, SCALE_FREE):
+    for rule in _rules(evaluation):
         console.print(rule, highlight=False, markup=False)
 
 
@@ -120,6 +127,18 @@ def _rungs_table(rungs: Sequence[Rung]) -> Table:
     for rung in rungs:
         table.add_row(*rung_cells(rung))
     return table
+
+
+def _split(evaluation: Evaluation) -> str:
+    if evaluation.scene_id:
+        return "stored_scene"
+    return "leave_one_out" if evaluation.options.reference_count is None else "references_and_queries"
+
+
+def _rules(evaluation: Evaluation) -> tuple[str, ...]:
+    first, *others = RULES
+    scale_free = () if evaluation.dataset.metric else (SCALE_FREE,)
+    return first, CHOICE_RULES[bool(evaluation.scene_id)], *others, *scale_free
 
 
 def _largest_error(evaluation: Evaluation) -> float:

@@ -4,10 +4,11 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from mapless import Client, LocalizationResult, NewReference, Rejected, RigidTransform
+from mapless import Client, LocalizationResult, NewReference, ReferenceUse, Rejected, RigidTransform
 from mapless.names import parse_reference_name
 from mapless_server.settings import Settings
 from mapless_tools.child import temporary_server
@@ -34,6 +35,7 @@ class Evaluation:
     """The results of an evaluation, one for each query, with its dataset and options.
 
     `reference_count` includes the query if one is left out; the references' trajectory radius is in the dataset's unit.
+    `scene_id` is the stored scene that was measured; empty for one of the dataset's own frames.
     """
 
     dataset: Dataset
@@ -41,6 +43,7 @@ class Evaluation:
     reference_count: int
     trajectory_radius: float
     results: tuple[QueryResult, ...]
+    scene_id: str = ""
 
 
 def evaluate(dataset: Dataset, options: EvaluationOptions, settings: Settings, progress: Progress) -> Evaluation:
@@ -78,15 +81,31 @@ def localize_queries(
     client: Client, plan: Plan, options: EvaluationOptions, progress: Progress
 ) -> tuple[QueryResult, ...]:
     """Localizes the plan's queries, one after the other."""
-    references = {frame.name: frame for frame in plan.references}
+    references = {frame.name: frame.world_from_camera for frame in plan.references}
     queries = tracked("localizing", plan.queries, len(plan.queries), progress)
     return tuple(localize_query(client, SCENE, query, options, references) for query in queries)
 
 
 def localize_query(
-    client: Client, scene: str, query: PlannedQuery, options: EvaluationOptions, references: Mapping[str, Frame]
+    client: Client,
+    scene: str,
+    query: PlannedQuery,
+    options: EvaluationOptions,
+    references: Mapping[str, RigidTransform],
 ) -> QueryResult:
     """Localizes one query; if it has no references, the server chooses k of those of the scene, given by name."""
+    return ask(client, scene, query, options, references)[0]
+
+
+def ask(
+    client: Client,
+    scene: str,
+    query: PlannedQuery,
+    options: EvaluationOptions,
+    references: Mapping[str, RigidTransform],
+    **flags: Any,
+) -> tuple[QueryResult, LocalizationResult | Rejected]:
+    """Localizes as `localize_query`, with flags of `Client.localize`; returns the answer itself, too."""
     frame = query.frame
     image = frame.image_path.read_bytes()
     mask = None if frame.mask_path is None else frame.mask_path.read_bytes()
@@ -100,10 +119,17 @@ def localize_query(
         scale_strategy=options.scale_strategy,
         reference_count=0 if query.references else options.k,
         mask=mask,
+        **flags,
     )
     latency_ms = 1000 * (time.perf_counter() - start_s)
     result = _result(frame, answer, query.references, latency_ms, references)
-    return replace(result, earlier=tuple(_earlier(frame, it) for it in earlier if isinstance(it, LocalizationResult)))
+    accepted = tuple(_earlier(frame, it) for it in earlier if isinstance(it, LocalizationResult))
+    return replace(result, earlier=accepted), answer
+
+
+def reference_id(use: ReferenceUse) -> str:
+    """The id of a reference that an answer used."""
+    return parse_reference_name(use.name)[1]
 
 
 def _earlier(frame: Frame, answer: LocalizationResult) -> EarlierAnswer:
@@ -116,18 +142,18 @@ def _result(
     answer: LocalizationResult | Rejected,
     given: Sequence[Frame],
     latency_ms: float,
-    references: Mapping[str, Frame],
+    references: Mapping[str, RigidTransform],
 ) -> QueryResult:
     diagnostics = answer.diagnostics
-    uses = {parse_reference_name(use.name)[1]: use for use in diagnostics.references}
-    used = list(given) or [references[name] for name in uses]
+    uses = {reference_id(use): use for use in diagnostics.references}
+    used = [it.name for it in given] or list(uses)
     centre = frame.world_from_camera.translation
-    distances = [float(np.linalg.norm(it.world_from_camera.translation - centre)) for it in used]
+    distances = [float(np.linalg.norm(references[it].translation - centre)) for it in used if it in references]
     found = answer if isinstance(answer, LocalizationResult) else None
     errors = pose_error(frame.world_from_camera, found.world_from_camera) if found else (math.inf, math.inf)
     return QueryResult(
         name=frame.name,
-        references=tuple(it.name for it in used),
+        references=tuple(used),
         translation_error=errors[0],
         rotation_error_deg=errors[1],
         reference_distance=float(np.median(distances)) if distances else math.inf,

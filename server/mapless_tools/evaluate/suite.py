@@ -294,7 +294,7 @@ def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[Run], set
     progress = labelled(setup.progress, f"{scene.place.name}, {setting_name(split.setting)}")
     planned = _with_references(scene, split, setup, progress)
     store_references(client, scene_id, split.references, progress)
-    references = {frame.name: frame for frame in split.references}
+    references = {frame.name: frame.world_from_camera for frame in split.references}
     for run in runs:
         options = EvaluationOptions(k=setup.options.k, variant=run.method.variant, scale_strategy=run.method.scale)
         progress = labelled(setup.progress, f"{scene.place.name}, {run.label}")

@@ -266,10 +266,16 @@ SUPPORTING_SHARE = 0.1
 
 def viewpoint_gap(support: PosedSupport) -> tuple[float, float]:
     """Distance to the nearest reference that holds the pose, over the median depth of the inliers; and that depth."""
-    pose, counts, depth_m = support.estimate.world_from_camera, support.inliers_by_reference(), support.distance_m()
-    holding = np.flatnonzero(np.array(counts) >= SUPPORTING_SHARE * max(counts))
-    centres = np.array([support.references[i].world_from_camera.translation for i in holding])
-    return float(np.linalg.norm(centres - pose.translation, axis=1).min()) / depth_m, depth_m
+    centres = np.array([it.world_from_camera.translation for it in support.references])
+    centre, depth_m = support.estimate.world_from_camera.translation, support.distance_m()
+    return holding_distance(centre, centres, support.inliers_by_reference()) / depth_m, depth_m
+
+
+def holding_distance(centre: Array, reference_centres: Array, inlier_counts: ArrayLike) -> float:
+    """Distance of a camera centre (3,) to the nearest of the references (R, 3) that hold its pose, by inliers (R,)."""
+    counts = np.asarray(inlier_counts)
+    holding = reference_centres[counts >= SUPPORTING_SHARE * counts.max()]
+    return float(np.linalg.norm(holding - centre, axis=1).min())
 
 
 def gap_ratio(gap: float) -> float:

@@ -16,7 +16,8 @@ poses. f and s are means of the posterior on a grid. The prior of f is log-norma
 n0 = (`scatter` / `factor_log`)^2 = 2.6 more answers had needed it; that of s is half-normal.
 
 The quantiles of trust are those of the n answers and of n0 = `trust_prior` answers whose trust is distributed as it is
-elsewhere, uniformly. Priors were chosen by leaving whole scenes out (server/research).
+elsewhere, uniformly. Factors that `mapless-server evaluate --calibrate` measures on photographs with known poses are
+fitted alike, without quantiles of trust. Priors were chosen by leaving whole scenes out (server/research).
 """
 
 from collections.abc import Sequence

@@ -7,8 +7,8 @@ from dataclasses import asdict, astuple, dataclass, replace
 import numpy as np
 
 from mapless.geometry import Array
-from mapless.scenes import FACTORS, MAX_FACTOR, MIN_FACTOR, Calibration
-from mapless_server.method.bundle.estimate import TAIL_95, Accuracy, growth, self_tail
+from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration
+from mapless_server.method.bundle.estimate import TAIL_95, USUAL_GAP, Accuracy, growth, self_tail
 from mapless_server.method.options import Variant
 from mapless_server.store import SceneAttributes, SelfCalibration
 
@@ -31,18 +31,17 @@ class Factors:
                 raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {value:g}")
 
     @classmethod
-    def of(cls, calibration: Calibration) -> "Factors":
-        """The factors of a scene's calibration."""
-        return cls(*(getattr(calibration, name) for name in FACTORS))
-
-    @classmethod
-    def of_references(cls, calibration: SelfCalibration, accuracy: Accuracy, gap: float) -> "Factors":
-        """Factors of a self-calibration for an answer with these radii at a gap, see `scenes.calibration.fit`."""
-        own, grown = calibration, growth(gap)
-        position = _factor(grown * own.position_factor, own.reference_noise_m, accuracy.position_68_m)
-        rotation = _factor(grown * own.rotation_factor, own.reference_noise_deg, accuracy.rotation_68_deg)
-        tail = self_tail(own.answer_count) / TAIL_95
-        return cls(position, max(MIN_FACTOR, position * tail), rotation, max(MIN_FACTOR, rotation * tail))
+    def of(cls, calibration: Calibration, accuracy: Accuracy, gap: float) -> "Factors":
+        """Factors of a calibration for an answer with these radii at a gap, see `scenes.calibration.fit`."""
+        known, grown = calibration, growth(gap) if calibration.grows_with_gap else 1.0
+        position = _factor(grown * known.position_factor_68, known.reference_noise_m, accuracy.position_68_m)
+        rotation = _factor(grown * known.rotation_factor_68, known.reference_noise_deg, accuracy.rotation_68_deg)
+        return cls(
+            position,
+            _bounded(position * known.position_factor_95 / known.position_factor_68),
+            rotation,
+            _bounded(rotation * known.rotation_factor_95 / known.rotation_factor_68),
+        )
 
 
 @dataclass(frozen=True)
@@ -57,6 +56,22 @@ class Conditions:
     backend: str
     variant: str
     server_version: str
+
+
+def calibration_of(found: SelfCalibration, conditions: Conditions) -> Calibration:
+    """The calibration that a fit to at least one answer gives for answers computed under these conditions."""
+    tail = self_tail(found.answer_count) / TAIL_95
+    return Calibration(
+        found.position_factor,
+        _bounded(tail * found.position_factor),
+        found.rotation_factor,
+        _bounded(tail * found.rotation_factor),
+        found.answer_count,
+        *astuple(conditions),
+        reference_noise_m=found.reference_noise_m,
+        reference_noise_deg=found.reference_noise_deg,
+        grows_with_gap=True,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,20 +109,26 @@ def reported_radii(
         attributes: attributes of the scene.
         gap: gap of the answer, see `method.bundle.estimate.viewpoint_gap`; None if unknown.
     """
-    measured = attributes.calibration
-    if measured is not None and measured.is_of(*astuple(conditions)):
-        factors, calibration, count = Factors.of(measured), "MEASURED", measured.query_count
-    else:
+    used, source = attributes.calibration, "MEASURED"
+    if used is None or not used.is_of(*astuple(conditions)):
         own = attributes.self_calibration(kind)
-        if own is None or not own.answer_count or conditions.variant != _SELF_CALIBRATED or gap is None:
+        if own is None or not own.answer_count or conditions.variant != _SELF_CALIBRATED:
             return ReportedRadii(accuracy, covariance)
-        factors, calibration, count = Factors.of_references(own, accuracy, gap), "SELF", own.answer_count
-    return ReportedRadii(scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors), calibration, count)
+        used, source = calibration_of(own, conditions), "SELF"
+    if gap is None and used.grows_with_gap:
+        return ReportedRadii(accuracy, covariance)
+    factors = Factors.of(used, accuracy, USUAL_GAP if gap is None else gap)
+    scaled = scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors)
+    return ReportedRadii(*scaled, source, used.query_count)
 
 
 def _factor(factor: float, noise: float, radius: float) -> float:
     """Ratio by which a radius grows if a factor multiplies it and a constant noise is added."""
-    return min(max(math.hypot(factor, noise / max(radius, sys.float_info.min)), MIN_FACTOR), MAX_FACTOR)
+    return _bounded(math.hypot(factor, noise / max(radius, sys.float_info.min)))
+
+
+def _bounded(factor: float) -> float:
+    return min(max(factor, MIN_FACTOR), MAX_FACTOR)
 
 
 def scaled_accuracy(accuracy: Accuracy, factors: Factors) -> Accuracy:
