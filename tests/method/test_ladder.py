@@ -16,6 +16,7 @@ from mapless_server.method.judge.hypothesis import (
 )
 from mapless_server.method.ladder import RUNGS, Situation, further
 from mapless_server.method.pairs.pair import Matching
+from mapless_server.method.promise import Known
 
 ALL = Situation(
     may_be_elsewhere=True,
@@ -92,6 +93,13 @@ def test_stronger_features_are_not_turned_where_most_matches_are_upright() -> No
     changed = {rung.name: it for rung, it in further(Attempt(), [Attempt()], Doubt.STARVED, situation)}
     assert changed["turned"].angles_deg == (0.0, 90.0)
     assert changed["stronger"] == Attempt(1)
+
+
+@pytest.mark.parametrize("any_roll", [None, 0])
+def test_first_features_are_worth_the_same_at_any_roll(any_roll: int | None) -> None:
+    situation = Situation(any_roll=any_roll, known=Known(agreement=2.5))
+    names = {rung.name for rung, _ in further(Attempt(), [Attempt()], Doubt.STARVED, situation)}
+    assert {"wide", "lines"} <= names
 
 
 def test_tracking_comes_first_where_a_prior_says_what_is_near() -> None:

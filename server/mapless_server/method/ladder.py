@@ -214,7 +214,8 @@ def further(
     for rung in RUNGS:
         attempt = rung.change(before, situation)
         if rung.doubts & doubts and rung.is_possible(before, situation) and attempt not in tried:
-            at_any_roll = attempt.features == situation.any_roll and attempt.features == before.features
+            # After upright features, those for any roll find less of what is upright than as the first ones.
+            at_any_roll = attempt.features == situation.any_roll == before.features > 0
             name = f"{rung.name} at any roll" if at_any_roll else rung.name
             if situation.known.is_worth(name, situation.promise):
                 yield rung, attempt
