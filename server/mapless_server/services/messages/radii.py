@@ -67,7 +67,7 @@ def calibration_of(found: SelfCalibration, conditions: Conditions) -> Calibratio
         found.rotation_factor,
         _bounded(tail * found.rotation_factor),
         found.answer_count,
-        *astuple(conditions),
+        **asdict(conditions),
         reference_noise_m=found.reference_noise_m,
         reference_noise_deg=found.reference_noise_deg,
         grows_with_gap=True,
