@@ -57,7 +57,7 @@ def client(address: str) -> Iterator[Client]:
         yield connected
 
 
-def answer(client: Client, **flags: bool) -> LocalizationResult:
+def answer(client: Client, **flags: Any) -> LocalizationResult:
     found = client.localize(encode(".png", PHOTOGRAPHS[4][0]), CAMERA, "hall", **flags)
     assert isinstance(found, LocalizationResult)
     return found
