@@ -31,7 +31,9 @@ def main(folder: Path) -> None:
         matrix = pose.matrix().tolist()
         frames.append({"image": f"images/{station.name}.jpg", **size, "dist": None, "world_from_camera": matrix})
     about = {"source": "rendered by server/research/rendered_room", "license": "Apache-2.0", "metric": True}
-    (folder / "cameras.json").write_text(json.dumps({**about, "frames": frames}, indent=1) + "\n")
+    one_a_line = ",\n".join(f"  {json.dumps(it)}" for it in frames)
+    head = json.dumps({**about, "frames": []}, indent=1)
+    (folder / "cameras.json").write_text(head.replace("[]", f"[\n{one_a_line}\n ]") + "\n")
     visible = {it.name: np.round(visible_edges(room, it), 4).tolist() for it in queries}
     outline = {"edges": np.round(room.outline, 4).tolist(), "visible_edges": visible}
     (folder / "outline.json").write_text(json.dumps(outline, separators=(",", ":")) + "\n")
