@@ -71,7 +71,8 @@ def main() -> None:
 def measure(arguments: argparse.Namespace) -> Sequence[Row]:
     """Asks what the arguments say."""
     if arguments.in_process:
-        return ask(accepted(arguments.scenes, QUERIES // arguments.every), arguments.json)
+        count = QUERIES // arguments.every
+        return ask(accepted(arguments.scenes, count), arguments.json, count)
     of = place_reader(arguments.scenes)
     asked_of: dict[str, Callable[[PlaceOf], Iterable[Asked]]] = {
         "other-place": partial(other_places, references=arguments.references),
@@ -85,15 +86,13 @@ def measure(arguments: argparse.Namespace) -> Sequence[Row]:
     return ask(answers(asked, arguments.store), arguments.json, len(asked))
 
 
-def ask(answered: Iterable[Row], file: Path, count: int | None = None) -> Sequence[Row]:
+def ask(answered: Iterable[Row], file: Path, count: int) -> Sequence[Row]:
     """Collects the rows; the file is written after each, since a run takes minutes."""
     begin_s, rows = time.perf_counter(), list[Row]()
     for row in answered:
         rows.append(row)
-        if count is None:
-            continue
-        line = f"{len(rows)}/{count} {row['name']}: {row['outcome']}, {row['processor_s']:.1f} s"
-        print(line, file=sys.stderr, flush=True)
+        cost = f", {row['processor_s']:.1f} s" if "processor_s" in row else ""
+        print(f"{len(rows)}/{count} {row['name']}: {row['outcome']}{cost}", file=sys.stderr, flush=True)
         write_json(file, {"answers": rows})
     write_json(file, {"answers": rows})
     print(f"{time.perf_counter() - begin_s:.0f} s", file=sys.stderr)

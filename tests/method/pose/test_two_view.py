@@ -19,7 +19,7 @@ from mapless_server.method.bundle.priors import IntrinsicsSigma, PosePrior, Prio
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.judge.answer import Localization
-from mapless_server.method.judge.cameras import wrong_camera
+from mapless_server.method.judge.cameras import compare_cameras, wrong_camera
 from mapless_server.method.judge.two_view import (
     TwoViewEvidence,
     lacks_distance,
@@ -37,6 +37,7 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.pose.two_view import TwoViewOptions, solve_two_view
 from mapless_server.method.pose.two_view_matches import TwoViewMatches
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
+from mapless_server.method.structure.model import PointMatches
 from mapless_server.method.structure.structure import StructureOptions
 
 TRUE = RigidTransform(rotation_from_vector([0.1, -0.15, 0.05]), np.array([0.3, -0.1, -4.2]))
@@ -279,6 +280,33 @@ def test_cameras_that_the_caller_allows_are_not_compared() -> None:
         assert wrong_camera(support, "a") is not None
     for support in (uncertain, without_evidence(uncertain)):
         assert wrong_camera(support, "a") is None
+
+
+@pytest.mark.parametrize("fitting", [40, 120])
+def test_a_camera_that_a_search_by_points_missed_is_not_accused(fitting: int) -> None:
+    """So many of 180 points fit a longer focal length, with which alone a pose is found; all lines fit the given one.
+
+    The camera is accused only where the points outweigh the lines.
+    """
+    random, problem = random_for("missed", fitting), planted((70, 60, 50))
+    longer = replace(CAMERA, focal_x_px=2**0.25 * CAMERA.focal_x_px, focal_y_px=2**0.25 * CAMERA.focal_y_px)
+    rays = longer.rays(problem.query.features.pixels())
+    depth_m = random.uniform(1, 9, (len(rays), 1))
+    x_in_world = np.where(
+        np.arange(len(rays))[:, None] < fitting, TRUE.apply(depth_m * rays), 10 * random.normal(size=rays.shape)
+    )
+    solved = problem.solved()
+    assert solved is not None
+    every = np.arange(len(rays))
+    structure = replace(solved.structure, x_in_world=x_in_world)
+    matches = PointMatches(every, every, np.zeros(len(rays), bool), 4.0)
+    missed = replace(
+        solved.estimate, world_from_camera=moved(TRUE, np.full(6, 0.5)), inliers=every < 8, intrinsics=None, view=None
+    )
+    support = replace(solved, structure=structure, matches=matches, estimate=missed, two_view=None)
+    compared = compare_cameras(support)
+    assert compared is not None
+    assert (compared.gain > 1.1 and compared.is_significant) == (fitting == 120)
 
 
 def without_evidence(support: PosedSupport) -> PosedSupport:

@@ -12,9 +12,10 @@ agree with one pose of a camera that is nearer to the true one. So poses are com
 values of k1, without the lens, and, where these are unusual, with the principal point in the centre and with square
 pixels; the score of `pose.relative` compares them, by points and by matches without points together.
 
-A camera is accused only if that is significant (`bundle.significance`): if the keypoints that score higher with another
-camera outweigh those that score lower by more than chance. A pose that other cameras explain better is rejected also
-where it is not significant, for lack of evidence.
+A camera is accused only if its best pose, found from all matches as that of the other camera is, scores lower, and if
+that is significant (`bundle.significance`): if the keypoints that score higher with another camera outweigh those that
+score lower by more than chance. A pose that other cameras explain better is rejected also where it is not significant,
+for lack of evidence.
 """
 
 from collections.abc import Iterator, Sequence
@@ -186,48 +187,63 @@ class _Compared:
         return replace(view, features=view.features.every(self.step))
 
     def own(self, given: Camera) -> "_Scored":
-        """The given camera with the scores of its best pose."""
-        query, found = self.support.query, list[_Scored]()
+        """The given camera with its best pose: the estimate, or another one."""
+        found = list[_Scored]()
         if isinstance(self.support, PosedSupport):
             estimate = self.support.estimate
             # The estimate's own intrinsics are those that were estimated with it, within what the caller allows.
-            view = self.thinned(estimate.view or query)
-            found.append(_Scored(given, self.scores_of(view, estimate.world_from_camera)))
+            view = self.thinned(estimate.view or self.support.query)
+            found.append(self._scored(given, self.matches_of(view), estimate.world_from_camera))
         if not self.by_lines:
-            found.append(_Scored(given, self.scores_of(self.thinned(query))))
+            found.append(self.scored(given))
         return max(found, key=lambda it: it.total)
 
-    def scores_of(self, view: View, pose: RigidTransform | None = None) -> Array:
-        """The score by keypoint (F,) of a pose, by default of the best one that is found, of a thinned view."""
+    def scored(self, camera: Camera) -> "_Scored":
+        """A camera with the best pose that a brief search finds, comparable with that of the given camera."""
+        matches = self.matches_of(self.read_as(camera))
+        pose = None
+        if self.by_lines:
+            pose = find_pose(matches, LINES)
+        elif len(matches.x_in_world) >= pnp.MIN_MATCHES:  # through a strong lens few may be seen
+            pose = ransac(matches.points, None, PNP)
+        found = self._scored(camera, matches, pose)
+        # Without points a wrong lens can reach the right camera's score more nearly than a wrong focal length.
+        is_bent = self.by_lines and camera.distortion != self.support.query.distortion
+        return replace(found, scores=found.scores / MIN_GAIN) if is_bent else found
+
+    def searched(self, before: "_Scored", other: "_Scored") -> "_Scored":
+        """A camera with the best of three poses: as before, the other camera's, and one found from all matches.
+
+        The search by points alone fails where few of them are right. Two cameras then differ by whether it failed.
+        """
+        matches = self.matches_of(self.read_as(before.camera))
+        poses = (other.pose, find_pose(matches, LINES))
+        return max([before, *(self._scored(before.camera, matches, it) for it in poses)], key=lambda it: it.total)
+
+    def read_as(self, camera: Camera) -> View:
+        """The photograph as read with a camera, with every `step`-th keypoint."""
+        return read_as(self.thinned(self.support.query), camera)
+
+    def matches_of(self, view: View) -> Evidence:
+        """The matches of a thinned view whose keypoints its camera sees."""
         is_seen = np.asarray(np.isfinite(view.features.keypoints).all(axis=1))
         points, keypoint, lines = self.x_in_world, self.keypoint, self.lines.read_as(view)
         if not is_seen.all():
-            points, keypoint, lines = (
-                points[is_seen[keypoint]],
-                keypoint[is_seen[keypoint]],
-                lines[is_seen[lines.keypoint]],
-            )
-        all_matches = Evidence(view, self.support.references, lines, points, keypoint)
-        if pose is None and self.by_lines:
-            pose = find_pose(all_matches, LINES)
-        elif pose is None and len(points) >= pnp.MIN_MATCHES:  # through a strong lens few may be seen
-            pose = ransac(all_matches.points, None, PNP)
-        return np.zeros(len(view.features)) if pose is None else scores_by_keypoint(all_matches, pose)
+            points, keypoint = points[is_seen[keypoint]], keypoint[is_seen[keypoint]]
+            lines = lines[is_seen[lines.keypoint]]
+        return Evidence(view, self.support.references, lines, points, keypoint)
 
-    def scored(self, camera: Camera) -> "_Scored":
-        """A camera with its scores, comparable with those of the given camera's pose."""
-        query = self.support.query
-        scores = self.scores_of(read_as(self.thinned(query), camera))
-        # Without points a wrong lens can reach the right camera's score more nearly than a wrong focal length.
-        is_bent = self.by_lines and camera.distortion != query.distortion
-        return _Scored(camera, scores / MIN_GAIN if is_bent else scores)
+    def _scored(self, camera: Camera, matches: Evidence, pose: RigidTransform | None) -> "_Scored":
+        count = len(matches.query.features)
+        return _Scored(camera, pose, np.zeros(count) if pose is None else scores_by_keypoint(matches, pose))
 
 
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """A camera and the scores (F,) of its best pose by keypoint."""
+    """A camera with a pose, None if none was found, and its scores (F,) by keypoint."""
 
     camera: Camera
+    pose: RigidTransform | None
     scores: Array
 
     @property
@@ -285,6 +301,8 @@ def compare_cameras(support: Support) -> Comparison | None:
     if not by_lines:
         between = _between(given, best.camera, steps)
         best, tested = max([best, *map(compared.scored, between)], key=lambda it: it.total), tested + len(between)
+        if is_significant(sigmas_of_gains(best.scores - own.scores), tested):
+            own, best = compared.searched(own, best), compared.searched(best, own)
     sent = query.photograph.camera if query.photograph else given
     checks = _differences(sent, prior_sigma, given, best.camera, steps)
     gain = best.total / own.total if own.total > 0 else np.inf if best.total > 0 else 0.0
