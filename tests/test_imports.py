@@ -155,7 +155,7 @@ def test_no_room_inside_method_is_in_a_circle() -> None:
 
 
 def test_the_list_of_the_method_is_complete_and_in_order() -> None:
-    """Of its modules, as the docstring of the room has it; one on the same line may import the one before it."""
+    """Order of a room's modules by its docstring; one on the same line may import the one before it."""
     known = modules_of("mapless_server")
     text = ast.get_docstring(parsed(known["mapless_server.method"])) or ""
     listed = [name for line in re.findall(r"^([a-z_, /]+?)  ", text, re.MULTILINE) for name in re.findall(r"\w+", line)]

@@ -13,7 +13,7 @@ from random import Random
 from .target import MutateBytes
 
 MEMORY_VARIABLE = "FUZZ_MEMORY"
-"""Of the environment: where folders are made for a process that ends without clearing up, as libFuzzer does."""
+"""Environment variable: where folders are made for a process that ends without clearing up, as libFuzzer does."""
 
 SEPARATOR = b"\n\xff\xfe\xff\n"
 _NUMBERS = (

@@ -48,7 +48,7 @@ KINDS = (pb.LocalizeRequest, pb.LocalizeRigRequest, pb.LocalizeSequenceRequest, 
 ENGINE = EngineOptions()
 TENANT = "acme"
 KNOWN = SceneAttributes(Datum(48.1, 11.6, 520.0, Quaternion(0.5, -0.5, -0.5, 0.5)))
-"""Of the scene that requests name."""
+"""Attributes of the scene that requests name."""
 
 CAMERA = Camera(32, 33, 30.0, 31.0, 15.5, 16.25)
 POSE = RigidTransform(rotation_from_vector([0.2, -0.7, 0.15]), np.array([1.5, -0.25, 2.0]))

@@ -277,7 +277,7 @@ def seeds() -> tuple[bytes, ...]:
 
 
 def _token(request: Any) -> str:
-    """Of the second page."""
+    """Token of the second page."""
     service, loop = _service()
     call = Call("id", 0.0, float("inf"), Principal(TENANT))
     token: str = loop.run_until_complete(getattr(service, METHODS[type(request)])(request, call)).next_page_token

@@ -18,13 +18,13 @@ import atheris
 from .target import TARGETS, load
 
 MAX_GROWTH_BYTES = 200 * 2**20
-"""Of the process by one input: more than the largest image takes that a target accepts, by far."""
+"""Largest growth of the process by one input: more than the largest image takes that a target accepts, by far."""
 MAX_CPU_S = 3.0
-"""Of one input, which are kilobytes. Processor time: machines are shared."""
+"""Largest processor time of one input of some kilobytes; not wall time, since machines are shared."""
 _HANG_S = 60
 _TOLD_EVERY = 1000
 _ANEW_SHARE = 0.4
-"""Of the inputs that are made of what is right; libFuzzer's corpus is mostly what is refused in yet another way."""
+"""Share of inputs that are made of what is right; libFuzzer's corpus mostly is refused in yet another way."""
 
 
 class Watched:

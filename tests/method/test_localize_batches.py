@@ -107,7 +107,7 @@ def test_without_an_initial_pose_there_is_no_coarse_answer() -> None:
 
 
 def test_one_querys_exception_does_not_fail_the_others() -> None:
-    """Of its check before and after the backend, and of the backend, which is not called after a failed check."""
+    """Its check raises before or after the backend, or the backend, which is not called after a failed check."""
     network = FakeNetwork(SCENE)
     fault, asked = MemoryError("of this query"), []
 

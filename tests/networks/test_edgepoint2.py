@@ -55,7 +55,7 @@ def test_outputs_are_those_of_the_official_network(variant: str) -> None:
 
 
 def random_network(variant: str) -> EdgePoint2:
-    """Of random weights, and of statistics that batch normalization could have learned."""
+    """A network with random weights, and with statistics that batch normalization could have learned."""
     torch.manual_seed(0)
     network = EdgePoint2(VARIANTS[variant]).eval()
     for module in network.modules():

@@ -113,7 +113,7 @@ def test_a_reduced_descriptor_has_signed_sums_of_the_full_one() -> None:
 
 @pytest.mark.parametrize("similarity", [0.0, 0.6, 0.95])
 def test_reduction_keeps_similarities(similarity: float) -> None:
-    """Of pairs of random directions of this similarity: no bias, and the stated deviation."""
+    """Estimates for pairs of random directions of this similarity have no bias, and the stated deviation."""
     random, count = np.random.default_rng(7), 500
     a, b = (unit_rows(random.normal(size=(count, 8448))) for _ in range(2))
     b = unit_rows(b - (a * b).sum(1, keepdims=True) * a)
@@ -211,7 +211,7 @@ def test_low_precision_changes_vectors_little(file: Path) -> None:
 
 
 def test_adding_another_networks_weights_lists_the_differences(file: Path, tmp_path: Path) -> None:
-    """Of the small network here: the entries are there, the shapes are not those of the published one."""
+    """Weights of the small network: the entries are there, the shapes are not those of the published one."""
     with pytest.raises(CheckpointError, match=r"does not fit MegaLoc: of its tensors .* of another shape"):
         add(named("megaloc"), file, tmp_path, unofficial=True)
     assert list(tmp_path.iterdir()) == []

@@ -102,7 +102,7 @@ def check(network: Network, case: dict[str, NDArray[Any]]) -> None:
 
 @torch.no_grad()
 def run(network: Network, given: torch.Tensor, case: dict[str, NDArray[Any]]) -> NetworkOutput:
-    """Of scenes whose views all have intrinsics or none, and of which at least two have a pose or none is used."""
+    """Scenes whose views all have intrinsics or none, and of which at least two have a pose or none is used."""
     scenes, views = given.shape[:2]
     layout = network.layout(patch_grid(given))
     inputs = {name.removeprefix("in_"): torch.from_numpy(a) for name, a in case.items() if name.startswith("in_")}

@@ -81,7 +81,7 @@ def test_the_runner_has_the_networks_output() -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ["pi3", "pi3x", "mapanything"])
 def test_a_compiled_runner_does_not_compile_again(name: str) -> None:
-    """That it compiles as a whole also shows that nothing in it waits for the device: that would break the graph."""
+    """It compiles as a whole, so nothing in it waits for the device: that would break the graph."""
     plain = NetworkRunner(shallow_network(name), name, "sha")
     compiled = NetworkRunner(shallow_network(name), name, "sha", compile_backend="eager")
     compiled.warm_up([CompiledShape(GRID, 3), CompiledShape((3, 2), 3)])

@@ -29,7 +29,7 @@ KITCHEN = "7scenes-redkitchen-seq01-first600"
 FOUNTAIN = "fountain-P11"
 nightly = partial(pytest.param, marks=pytest.mark.nightly)
 PAIRS = PairMatches()
-"""Of all tests: matches depend on the photographs alone."""
+"""Matches that all tests share: they depend on the photographs alone."""
 
 
 @cache

@@ -62,7 +62,7 @@ def walk_of(frames: Sequence[Frame], start: int) -> tuple[list[Frame], list[byte
 
 @pytest.mark.parametrize("start", STARTS)
 def test_a_sequence_is_no_worse_than_its_photographs(kitchen: tuple[Client, Sequence[Frame]], start: int) -> None:
-    """Of a device that loses 2 % of its way, in half metres. Photographs lost alone count as infinitely wrong."""
+    """Poses of a device that loses 2 % of its way, in half metres. Photographs lost alone count as infinitely wrong."""
     client, frames = kitchen
     walk, images, truth = walk_of(frames, start)
     alone = [client.localize(image, frame.camera, "kitchen") for image, frame in zip(images, walk, strict=True)]

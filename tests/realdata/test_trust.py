@@ -80,7 +80,7 @@ def test_a_scene_with_half_its_references_moved_is_ambiguous(photographs: Photog
 
 
 def all_places() -> dict[str, Place]:
-    """Of all metric scenes, and of the others."""
+    """All places, metric ones first, by name."""
     return {name: read_place_once(name) for name in dict.fromkeys([*(name for name, _ in METRIC), *OTHERS])}
 
 
@@ -115,7 +115,7 @@ def test_no_query_is_localized_in_another_place(photographs: Photographs, part: 
 
 
 def trust_of(measured: Measured) -> float:
-    """Of what is answered; 0 of what is not."""
+    """Trust of what is answered; 0 of what is not."""
     outcome = measured.answer.outcome
     return outcome.trust or 0.0 if isinstance(outcome, Localization) else 0.0
 

@@ -203,7 +203,7 @@ class TestLens:
 
 @pytest.fixture(scope="module")
 def usual(tmp_path_factory: pytest.TempPathFactory) -> SelfCalibration:
-    """Of the references as they are."""
+    """The calibration of the references as they are."""
     with Folder(tmp_path_factory.mktemp("usual")).open() as store:
         store.create_scene(SCENE)
         return found_in(store, REFERENCES)

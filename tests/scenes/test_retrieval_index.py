@@ -15,7 +15,7 @@ from mapless_server.store import IndexedReference, SceneChanges
 
 DIMENSION = 24
 SIMILARITY_TOLERANCE = 5e-3
-"""Of whole numbers of 8 bits, with as few numbers as here."""
+"""Error of whole numbers of 8 bits, with as few numbers as here."""
 
 POOL = unit_rows(random_for("index").standard_normal((64, DIMENSION))).astype(np.float32)
 QUERY = POOL[0]
@@ -133,7 +133,7 @@ def test_entries_stay_as_they_were() -> None:
 
 
 def test_readers_see_one_generation_whole_during_changes() -> None:
-    """Of every generation there are ten references that stand at x = generation; never some of them."""
+    """Every generation has ten references, at x = generation; a search sees all of them or none."""
     index = SceneIndex(DIMENSION)
     torn: list[str] = []
     done = threading.Event()

@@ -272,7 +272,7 @@ def test_the_ratio_decides_what_counts_as_a_match() -> None:
 
 
 DIGESTS = {"sift": "53ac1a6f", "aliked": "d26d2f4e", "xfeat": "8c987f94", "edgepoint2-l64": "94322c2c"}
-"""Of the shipped vocabularies. Another digest makes another name, and all stored descriptors are computed again."""
+"""Digests of the shipped vocabularies. Another one makes another name; stored descriptors are computed again."""
 
 LENGTHS = {"sift": 128, "aliked": 128, "xfeat": 64, "edgepoint2-l64": 64}
 

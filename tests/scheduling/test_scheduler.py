@@ -149,7 +149,7 @@ class TestOrder:
         assert order == ["refine", "refine", "refine", "prepare"] * 3
 
     def test_a_short_step_does_not_wait_for_long_ones(self) -> None:
-        """Of two threads one computes a long step at a time, while shorter ones keep coming."""
+        """One of two threads computes a long step at a time, while shorter ones keep coming."""
         toy = Toy()
         toy.learn("prepare", "toy", 9.0, "long")
         toy.learn("prepare", "toy", 9.0, "long too")

@@ -80,7 +80,7 @@ def test_a_step_beyond_the_bounds_takes_no_room() -> None:
 
 
 def test_what_waits_for_an_idle_thread_is_no_job_of_its_caller() -> None:
-    """Whose next job is admitted like a first one, which needs no more than its turn among the others' jobs."""
+    """The client's next job is admitted like a first one, which needs no more than its turn among the others' jobs."""
     toy = Toy()
     job = again(toy, "slow", 4)
     toy.admit(client="other 0")

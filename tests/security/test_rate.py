@@ -124,7 +124,7 @@ def test_a_wrong_limit_is_rejected_by_name(rate: float, burst_s: float, named: s
 
 @given(quiet_s=st.floats(0.01, 0.3), count=st.integers(1, 5))
 def test_a_token_gets_its_part_beside_one_that_asks_for_all(quiet_s: float, count: int) -> None:
-    """Of one tenant, whose rate is kept: what the quiet ones use, the other one does not get."""
+    """One tenant's rate is kept: what the quiet ones use, the other one does not get."""
     limiter, quiet_got_s, refused, all_s = RateLimiter(1.0, 10.0), 0.0, 0, 0.0
     for i in range(2000):
         now_s = 0.1 * i

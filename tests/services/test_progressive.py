@@ -77,7 +77,7 @@ async def test_an_error_comes_in_the_place_of_the_final_answer(better: Sequence[
 
 
 async def test_a_caller_that_stops_reading_ends_the_job() -> None:
-    """Which does not end by itself."""
+    """The job does not end by itself."""
     messages = Planted([1]).messages()
     await anext(messages)
     await asyncio.wait_for(messages.aclose(), 10)

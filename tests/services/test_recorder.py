@@ -151,7 +151,7 @@ def recording(folder: Path, store: Store, counts: Counts, **options: Any) -> Ite
 
 
 def answer(recorder: Recorder, tenant: str = "default", *references: PosedView) -> pb.LocalizeResponse:
-    """Of a call that was answered with these references."""
+    """The record of a call that was answered with these references."""
     call = Call("id", time.monotonic(), math.inf, Principal(tenant=tenant))
     query = SimpleNamespace(photo=SimpleNamespace(field="image"))
     result = SimpleNamespace(choice=None, references=references, generation=1, attributes=SceneAttributes())
@@ -279,7 +279,7 @@ def test_a_call_whose_blobs_are_deleted_is_collected_again(
 def test_a_call_deleted_while_queued_is_not_captured(
     tmp_path: Path, store: Store, monkeypatch: pytest.MonkeyPatch, deleted: str
 ) -> None:
-    """Of a scene that is made anew neither: a call that used no reference is one of the scene before."""
+    """Nor of a scene that is made anew: a call that used no reference is one of the scene before."""
     counts, get_scene, let_go = Counts(), StoreReader.get_scene, threading.Event()
 
     def slow(self: Any, scene_key: SceneKey) -> SceneRecord:

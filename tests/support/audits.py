@@ -17,7 +17,7 @@ Load = Callable[[Sequence[str]], Sequence[PosedView]]
 
 
 def entries_of(references: Sequence[PosedView]) -> Entries:
-    """Of references without descriptors, at generation 1."""
+    """Index entries of references without descriptors, at generation 1."""
     index = SceneIndex(1)
     ids = [parse_reference_name(it.name)[1] for it in references]
     added = [
@@ -29,7 +29,7 @@ def entries_of(references: Sequence[PosedView]) -> Entries:
 
 
 def finder_of(references: Sequence[PosedView], load: Load | None = None) -> ReferenceFinder:
-    """Of references in memory; those similar to one are the nearest."""
+    """A finder of references in memory; those similar to one are the nearest."""
     by_name = {it.name: it for it in references}
     centres = np.array([it.world_from_camera.translation for it in references]).reshape(-1, 3)
 

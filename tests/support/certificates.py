@@ -38,7 +38,7 @@ class Pair:
 
 
 def options_of(client: Pair | None = None, root: Pair | None = None, **more: Any) -> ConnectOptions:
-    """Of a client with this certificate that trusts this root, and tries once."""
+    """Options of a client with this certificate that trusts this root, and tries once."""
     return ConnectOptions(
         timeout_s=10,
         max_attempts=1,

@@ -106,7 +106,7 @@ class Failing(grpc.GenericRpcHandler):
 
     @property
     def methods(self) -> list[str]:
-        """Of the calls that came."""
+        """Methods of the calls that came."""
         return [method for method, _ in self.tries]
 
 

@@ -31,6 +31,6 @@ def query_result(
 
 
 def evaluation(*results: QueryResult, metric: bool = True, references: int | None = None) -> Evaluation:
-    """Of a folder whose references have a trajectory of radius 4."""
+    """An evaluation of a folder whose references have a trajectory of radius 4."""
     dataset = Dataset("kitchen", (), metric, "survey")
     return Evaluation(dataset, EvaluationOptions(references), 30, 4.0, results)

@@ -107,7 +107,7 @@ def images_of(
 
 
 def matches_with_references(structure: Structure, matches: PointMatches, count: int) -> tuple[Matches, ...]:
-    """Of a photograph with each of the references that observe its points."""
+    """Matches of a photograph with each of the references that observe its points."""
     keypoint_of = np.full(len(structure.x_in_world), -1)
     keypoint_of[matches.point] = matches.keypoint
     tracks = structure.tracks

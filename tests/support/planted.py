@@ -70,7 +70,7 @@ def true_structure(scene: SyntheticScene, noise: KeypointNoise = ONE_PIXEL) -> t
 
 
 NOISE = KeypointNoise(0.5, 0.0)
-"""Of the scenes' keypoints by default."""
+"""Noise of the scenes' keypoints by default."""
 
 
 def metric_scale(world_from_local: Similarity, world_from_query: RigidTransform) -> MetricScale:

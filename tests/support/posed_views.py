@@ -32,7 +32,7 @@ def planted(count: int = 8) -> list[PosedView]:
 
 @cache
 def matched(count: int = 8) -> list[MatchedPair]:
-    """Of the planted views: matches do not depend on poses."""
+    """Matches of the planted views, which do not depend on poses."""
     views, found = planted(count), []
     for i, j in combinations(range(len(views)), 2):
         first, second = views[i].view, views[j].view

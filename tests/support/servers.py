@@ -256,7 +256,7 @@ class RunningServer:
     stop: Callable[[], None]
 
     def value(self, name: str, **labels: str) -> float:
-        """Of a metric, summed over the labels that are not given."""
+        """The value of a metric, summed over the labels that are not given."""
         samples = (sample for family in self.metrics.registry.collect() for sample in family.samples)
         return sum(it.value for it in samples if it.name == name and labels.items() <= it.labels.items())
 

@@ -40,7 +40,7 @@ MAX_BATCH = 8
 
 
 class PlantedError(Exception):
-    """Of a job."""
+    """An error that a job raises."""
 
 
 class LostDevice(Exception):

@@ -232,7 +232,7 @@ def test_a_flat_wall_contradicts_no_focal_length() -> None:
 
 
 def evidence_of(lens: Distortion | None, value: tuple[float, ...]) -> IntrinsicsEvidence:
-    """Of a photograph that was reduced to half its size."""
+    """Evidence about a photograph that was reduced to half its size."""
     sent = Camera(1280, 960, 1050.0, 1052.0, 641.0, 479.0, lens)
     sigma, covariance = np.array([0.002, 1.0, 1.0, 0.01]), np.zeros((4, 4))
     prior_sigma, motion = IntrinsicsSigma().of(sent.resized(640, 480)), np.zeros((6, 4))
@@ -338,7 +338,7 @@ def support_of(
     given_lens: Distortion | None = None,
     count: int | None = None,
 ) -> tuple[PosedSupport, Camera]:
-    """Of a photograph with intrinsics that are wrong by these factors, and seem so by `doubted` standard deviations.
+    """The support of a photograph with intrinsics wrong by these factors, by `doubted` standard deviations.
 
     They may be estimated with the pose, and the lens may be another than the given one. It has so many matches.
     """

@@ -202,7 +202,7 @@ def planted(case: str, count: int = 8) -> tuple[Array, Array, Array, PoseErrors]
 
 
 def test_the_drift_has_the_covariance_of_a_random_walk() -> None:
-    """Of the errors in the world: a shift of the centre by -R^T v, a rotation by R^T w."""
+    """Errors in the world: a shift of the centre by -R^T v, a rotation by R^T w."""
     centres, rotations, query, errors = planted("walk", 4)
     spacing_m = float(np.median([np.linalg.norm(a - b) for i, a in enumerate(centres) for b in centres[:i]]))
     random, places = random_for("walks"), np.concatenate([query[None], centres])

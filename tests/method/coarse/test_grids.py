@@ -23,7 +23,7 @@ from mapless_server.method.coarse.grids import (
 from mapless_server.method.features.views import undistort_pixels
 
 OFFICIAL_PIXEL_LIMIT = 255_000
-"""Of the official loader; 574x434 for 4:3."""
+"""Number of pixels of the official loader's grids; 574x434 for 4:3."""
 BARREL = RadialTangential(-0.25, 0.07, 0.001, -0.0015, -0.005)
 CAMERAS = {
     "pinhole": Camera(960, 720, 816.0, 820.0, 470.5, 365.5),

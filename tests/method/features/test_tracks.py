@@ -12,7 +12,7 @@ from mapless_server.method.features.views import Matches
 
 Pairs = Mapping[tuple[int, int], Matches]
 Track = frozenset[tuple[int, int]]
-"""Of (view, keypoint)."""
+"""A track's observations (view, keypoint)."""
 
 
 def pairs_of(matches: Mapping[tuple[int, int], Sequence[tuple[int, int]]]) -> Pairs:

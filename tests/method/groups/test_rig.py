@@ -238,7 +238,7 @@ NAMES = [reference.name for reference in SCENE.references]
 
 
 def hint_of(reason: RejectionReason, *matches: tuple[int, ...]) -> Hint:
-    """Of a group whose photographs share so many features with the references."""
+    """The result of a group whose photographs share so many features with the references."""
     images = [
         (Answer(Rejection(reason, "alone"), reference_match_counts=counts), SCENE.references) for counts in matches
     ]

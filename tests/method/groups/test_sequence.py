@@ -234,7 +234,7 @@ def test_wrong_axes_of_a_session_are_named(sent: str, count: int) -> None:
 
 
 def test_a_single_step_names_no_axes() -> None:
-    """Which a jump of the device may resemble by chance."""
+    """A jump of the device may resemble other axes by chance."""
     random = random_for("one step")
     truth = climb(2)
     session = [pose_to(Axes.ARCORE, it) for it in truth]

@@ -29,7 +29,7 @@ ORIGIN = np.array([4e5, 5.1e6, 300.0])
 
 @dataclass(frozen=True)
 class Errors:
-    """Of a planted network: the scale common to all depths and the step, each depth, keypoints, share of matches."""
+    """Errors of a planted network: scale common to all depths and step, each depth, keypoints, share of matches."""
 
     scale: float = 0.03
     depth: float = 0.05

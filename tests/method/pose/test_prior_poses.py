@@ -220,7 +220,7 @@ def gravity_at(pose: RigidTransform, sigma_deg: float, tilt_deg: float = 0.0) ->
 
 
 def all_priors(pose: RigidTransform, off: float) -> Priors:
-    """Of all kinds, a little off."""
+    """Priors of all kinds, a little off."""
     there = moved(pose, off * np.array([1.0, -1, 2, 0.5, 0.3, -0.4]))
     return Priors(
         PositionPrior(there.translation, np.diag([0.02, 0.03, 0.04]) ** 2),

@@ -310,7 +310,7 @@ def test_a_camera_that_a_search_by_points_missed_is_not_accused(fitting: int) ->
 
 
 def without_evidence(support: PosedSupport) -> PosedSupport:
-    """Whose equations of the errors of the intrinsics are singular."""
+    """The support with singular equations of the intrinsics' errors."""
     assert support.estimate is not None
     return replace(support, estimate=replace(support.estimate, intrinsics=None))
 
