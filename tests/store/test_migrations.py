@@ -1,173 +1,159 @@
-"""Every schema that was ever released becomes the present one, and loses nothing; on either database."""
+"""Stores of earlier releases become the present schema and lose nothing; on either database.
 
+`released` has a store of each release as SQL: four references of which one was deleted, and a scene without references.
+"""
+
+import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
-from sqlalchemy import Connection, insert, text
-from support.stores import EXTRACTOR, Folder, Place, Shared, assert_same_view, make_reference, view_of
+from support.stores import EXTRACTOR, Place, Shared, faults_of, make_reference
 
+from mapless.geometry import Camera
 from mapless_server.security import SceneKey
-from mapless_server.store import SceneAttributes, Store, StoreError, rows
+from mapless_server.store import Store, StoreError
 from mapless_server.store.backup import back_up, restore
-from mapless_server.store.migrations import migrate, run_steps
-from mapless_server.store.sqlite import DATABASE_FILE
-from mapless_server.store.tables import SCHEMA_VERSION, features, image, metadata, reference, scene_generation
+from mapless_server.store.tables import SCHEMA_VERSION, metadata
 
-OFFICE = SceneKey("office")
-
-
-class Raw:
-    """A database as it is before any of ours has opened it."""
-
-    def __init__(self, place: Place) -> None:
-        from mapless_server.store.postgresql import _create_engine, parse_url
-        from mapless_server.store.sqlite import create_sqlite_engine
-
-        if isinstance(place, Shared):
-            # As text: reflection does not read what is sent in binary.
-            self.engine = _create_engine(parse_url(place.url), cursors_are_binary=False)
-        else:
-            assert isinstance(place, Folder)
-            place.data_dir.mkdir(exist_ok=True)
-            self.engine = create_sqlite_engine(place.data_dir / DATABASE_FILE)
-
-    def __enter__(self) -> Connection:
-        self.transaction = self.engine.begin()
-        return self.transaction.__enter__()
-
-    def __exit__(self, *exception: object) -> None:
-        self.transaction.__exit__(*exception)  # type: ignore[arg-type]
-        self.engine.dispose()
+OFFICE, EMPTY = SceneKey("office"), SceneKey("empty")
+RELEASES = {"0.2.0": 3, "0.3.0": 9}
+"""Their schemas."""
 
 
-def make_version_1(place: Place) -> None:
-    """A store with rows as the first release wrote them, which knew nothing of alembic."""
-    made = [make_reference(it, seed) for seed, it in enumerate("abc")]
-    with Raw(place) as connection:
-        run_steps(connection, None, 1)
-        connection.execute(text("DROP TABLE alembic_version"))
-        connection.execute(text("INSERT INTO scene (scene_id, create_time_us) VALUES ('office', 5), ('empty', 6)"))
-        for scene_id, generation in (("office", 7), ("empty", 1), ("deleted", 9)):
-            connection.execute(insert(scene_generation).values(scene_id=scene_id, generation=generation))
-        for new in made:
-            record = rows.new_record(OFFICE, new, rows.time_of(8))
-            row = rows.reference_row(record)
-            del row["mask_sha256"]  # of a later schema
-            connection.execute(insert(reference).values(row))
-            connection.execute(insert(image).values(reference_key=record.key, data=new.image))
-            connection.execute(insert(features).values(rows.features_row(record.key, EXTRACTOR, view_of(new))))
+def make_store_of(release: str, place: Place) -> None:
+    """Makes the store that the release has written."""
+    kind = "postgresql" if isinstance(place, Shared) else "sqlite"
+    place.run_script((Path(__file__).parent / "released" / f"{release}.{kind}.sql").read_text())
 
 
-def test_a_store_of_the_first_release_keeps_every_byte(place: Place) -> None:
-    make_version_1(place)
-    tables = ("reference", "image", "features", "scene_generation")
-    columns = {"reference": "key, scene_id, reference_id, geometry, geometry_sha256, image_sha256, feature_count"}
-    before = {it: place.fetch(f"SELECT {columns.get(it, '*')} FROM {it} ORDER BY 1") for it in tables}
+@pytest.mark.parametrize("release", RELEASES)
+def test_a_store_of_an_earlier_release_is_usable(place: Place, release: str) -> None:
+    make_store_of(release, place)
+    for _ in range(2):  # when it is upgraded, and afterwards
+        with place.open() as store:
+            assert_all_is_there(store, release)
+    assert faults_of(place) == ()
+    assert place.fetch("SELECT version_num FROM alembic_version") == [(str(SCHEMA_VERSION),)]
+    assert place.fetch("SELECT schema_version FROM store_version") == [(SCHEMA_VERSION,)]
     with place.open() as store:
-        assert {it: place.fetch(f"SELECT {columns.get(it, '*')} FROM {it} ORDER BY 1") for it in tables} == before
-        office, empty = store.get_scene(OFFICE), store.get_scene(SceneKey("empty"))
-        assert (office.generation, office.reference_count) == (7, 3)
-        assert (empty.generation, empty.reference_count) == (1, 0)
-        snapshot = store.load_references(OFFICE, None, EXTRACTOR)
-        for seed, loaded in enumerate(snapshot.references):
-            assert_same_view(loaded.view, view_of(make_reference("", seed)))
-        changes = store.list_changes(OFFICE, 6, "vlad")
-        assert (changes.is_whole, len(changes.added)) == (True, 3)
         store.delete_reference(OFFICE, "b")
-        store.add_references(OFFICE, [make_reference("d")])
-        changes = store.list_changes(OFFICE, 7, "vlad")
-        assert ([it.reference_id for it in changes.added], len(changes.removed)) == (["d"], 1)
-        assert store.create_scene(SceneKey("deleted")).generation == 10
-    with place.open() as store:
-        assert store.get_scene(OFFICE).reference_count == 3
-        assert place.fetch("SELECT version_num FROM alembic_version") == [(str(SCHEMA_VERSION),)]
-        assert place.fetch("SELECT schema_version FROM store_version") == [(SCHEMA_VERSION,)]
+        store.add_references(OFFICE, [make_reference("e", dimension=4)])
+        changes = store.list_changes(OFFICE, 3, "vlad")
+        assert ([it.reference_id for it in changes.added], len(changes.removed)) == (["e"], 1)
 
 
-def test_a_store_of_the_second_release_has_no_attributes(place: Place, tmp_path: Path) -> None:
-    """Its servers may still be there, too, and go on creating scenes."""
-    create = "INSERT INTO scene (scene_id, create_time_us, first_generation) VALUES (?, 5, 1)"
-    with Raw(place) as connection:
-        run_steps(connection, None, 2)
-        connection.execute(insert(scene_generation).values(scene_id="office", generation=1))
-        connection.execute(insert(scene_generation).values(scene_id="hall", generation=1))
-    place.execute(create, "office")
-    if isinstance(place, Folder):
-        with closing(place.open_as_is()) as database:
-            assert back_up(database, tmp_path / "backup").faults == ()
-        with Store.open(tmp_path / "other") as store:
-            assert restore(tmp_path / "backup", store.database).faults == ()
-            assert store.get_scene(OFFICE).attributes == SceneAttributes()
-    with place.open() as store:
-        assert store.get_attributes(OFFICE) == SceneAttributes()
-        known = store.update_scene(OFFICE, down_in_world=(0.0, 0.0, -1.0))
-        place.execute(create, "hall")
-        assert store.get_scene(SceneKey("hall")).attributes == SceneAttributes()
-    with place.open() as store:
-        assert store.get_scene(OFFICE) == known
+def assert_all_is_there(store: Store, release: str) -> None:
+    """Asserts that scenes, photographs, features, descriptors and poses are those that were written."""
+    office, empty = store.get_scene(OFFICE), store.get_scene(EMPTY)
+    assert (office.generation, office.reference_count, office.attributes.down_in_world) == (3, 3, (0.0, 0.0, -1.0))
+    assert (empty.generation, empty.reference_count) == (1, 0)
+    changes = store.list_changes(OFFICE, 2, "vlad")
+    assert (len(changes.added), len(changes.removed)) == (0, 1)
+    indexed = store.list_changes(OFFICE, 0, "vlad").added
+    for number, (reference_id, found) in enumerate(
+        zip("abc", store.load_references(OFFICE, None, EXTRACTOR).references, strict=True)
+    ):
+        camera = Camera(64, 48, 50.25 + number, 51.0, 31.5, 23.5)
+        assert (found.record.reference_id, found.record.camera, found.view.camera) == (reference_id, camera, camera)
+        pose = found.record.world_from_camera
+        np.testing.assert_array_equal(pose.rotation, np.roll(np.eye(3), number, axis=0))
+        np.testing.assert_array_equal(pose.translation, [number, 2.5, -1])
+        features = found.view.features
+        np.testing.assert_array_equal(features.keypoints, np.arange(8).reshape(4, 2) + number / 4)
+        np.testing.assert_array_equal(features.unit_descriptors(), np.roll(np.eye(4, 8), number, axis=1))
+        np.testing.assert_array_equal(features.sizes_px, np.full(4, 2 + number))
+        np.testing.assert_array_equal(indexed[number].descriptor, np.roll(np.eye(4)[0], number))
+        assert store.read_image(OFFICE, reference_id) == bytes([number]) * 8
+        has_mask = release != "0.2.0" and reference_id == "c"
+        assert store.read_mask_of(found.record.key) == (b"mask" if has_mask else b"")
 
 
-@pytest.mark.parametrize("start", ["nothing", "first release", "steps"])
+@pytest.mark.parametrize("start", ["nothing", *RELEASES])
 def test_all_ways_lead_to_the_same_schema(place: Place, start: str) -> None:
-    if start == "first release":
-        make_version_1(place)
-    if start == "steps":
-        with Raw(place) as connection:
-            run_steps(connection, None, SCHEMA_VERSION)
+    if start in RELEASES:
+        make_store_of(start, place)
     place.open().close()
-    with Raw(place) as connection:
+    with place.inspected() as connection:
         options = {"compare_type": True, "compare_server_default": True}
         # Alembic leaves its own table out of the comparison.
         context = MigrationContext.configure(connection, opts=options)
-        others = [it for it in compare_metadata(context, metadata) if "alembic_version" not in str(it)]
-        assert others == []
-        assert migrate(connection) == SCHEMA_VERSION
+        assert [it for it in compare_metadata(context, metadata) if "alembic_version" not in str(it)] == []
 
 
-def test_a_newer_schema_is_refused(place: Place) -> None:
-    place.open().close()
-    place.execute("UPDATE store_version SET schema_version = ?", SCHEMA_VERSION + 1)
+@pytest.mark.parametrize("release", RELEASES)
+def test_backups_of_earlier_releases_are_restored(place: Place, release: str, tmp_path: Path) -> None:
+    make_store_of(release, place)
+    with closing(place.open_as_is()) as database:
+        if isinstance(place, Shared):
+            with pytest.raises(StoreError, match=f"version {RELEASES[release]}.*with the release that uses"):
+                back_up(database, tmp_path / "backup")
+            return
+        assert back_up(database, tmp_path / "backup").faults == ()
+    with Store.open(tmp_path / "other") as store:
+        assert restore(tmp_path / "backup", store.database).faults == ()
+        assert store.load_references(OFFICE, ["a"], EXTRACTOR).references[0].record.camera.width_px == 64
+
+
+@pytest.mark.parametrize(
+    ("version", "advice"),
+    [
+        (SCHEMA_VERSION + 1, f"newer release.*version {SCHEMA_VERSION + 1}.*up to {SCHEMA_VERSION}; use that release"),
+        (2, "version 2, .*before release 0.2.0.*`mapless-server store migrate` of release 0.3.0"),
+        (5, "version 5, .*between releases.*`mapless-server store migrate` of release 0.3.0"),
+    ],
+)
+def test_other_schemas_are_refused_with_advice(place: Place, version: int, advice: str) -> None:
+    make_store_of("0.2.0", place)
+    place.execute("UPDATE store_version SET schema_version = ?", version)
     for _ in range(2):
-        with pytest.raises(StoreError, match=f"has version {SCHEMA_VERSION + 1}.*up to {SCHEMA_VERSION}"):
+        with pytest.raises(StoreError, match=advice):
             place.open()
-    assert place.fetch("SELECT schema_version FROM store_version") == [(SCHEMA_VERSION + 1,)]
+    assert place.fetch("SELECT schema_version FROM store_version") == [(version,)]
 
 
 def test_the_database_of_another_program_is_refused(place: Place) -> None:
-    with Raw(place) as connection:
-        connection.execute(text("CREATE TABLE scene (name TEXT)"))
+    place.run_script("CREATE TABLE scene (name TEXT)")
     with pytest.raises(StoreError, match="another program"):
         place.open()
     assert place.fetch("SELECT * FROM scene") == []
 
 
-def test_a_step_that_fails_changes_nothing(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mapless_server.store import migrations
-
-    make_version_1(place)
-
-    def fail(*_: object) -> None:
-        raise ValueError("the last step failed")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(migrations, "write_version", fail)
-        with pytest.raises(StoreError, match="the last step failed"):
-            place.open()
-    assert place.fetch("SELECT schema_version FROM store_version") == [(1,)]
-    with pytest.raises(Exception, match="reference_count"):
-        place.fetch("SELECT reference_count FROM scene")
+@pytest.mark.parametrize("release", RELEASES)
+def test_a_killed_upgrade_is_made_at_the_next_start(place: Place, release: str) -> None:
+    make_store_of(release, place)
+    program = """
+import os, signal, sys
+from pathlib import Path
+from alembic.operations import Operations
+from mapless_server.store import Store
+create_index = Operations.create_index
+def killed(operations, name, *arguments, **options):
+    create_index(operations, name, *arguments, **options)
+    if name == "reference_by_image":
+        os.kill(os.getpid(), signal.SIGKILL)
+Operations.create_index = killed
+where = sys.argv[1]
+Store.connect(where) if where.startswith("postgresql") else Store.open(Path(where))
+"""
+    where = place.url if isinstance(place, Shared) else str(place.data_dir)
+    ended = subprocess.run([sys.executable, "-c", program, where], timeout=60)
+    assert ended.returncode == -signal.SIGKILL
+    assert place.fetch("SELECT schema_version FROM store_version") == [(RELEASES[release],)]
     with place.open() as store:
-        assert store.get_scene(OFFICE).reference_count == 3
+        assert_all_is_there(store, release)
 
 
 @pytest.mark.parametrize("is_empty", [True, False])
 def test_of_servers_that_start_at_once_one_migrates(shared: Shared, is_empty: bool) -> None:
     if not is_empty:
-        make_version_1(shared)
+        make_store_of("0.2.0", shared)
     with ThreadPoolExecutor(6) as pool:
         stores: list[Store] = list(pool.map(lambda _: shared.open(), range(6)))
     try:

@@ -1,7 +1,7 @@
 """Databases for tests that hold on each of them, and references that follow from a seed."""
 
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -9,12 +9,13 @@ from typing import Any, TypeAlias
 import numpy as np
 import psycopg
 import pytest
+from sqlalchemy import Connection, Engine
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.lenses import Distortion
 from mapless_server.method.features.views import Features, View
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, Store, rows, sqlite
+from mapless_server.store import NewReference, Store, postgresql, rows, sqlite
 from mapless_server.store.postgresql import PostgresqlDatabase
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.store import DEFAULT_CACHE_BYTES
@@ -48,6 +49,16 @@ class Folder:
         with closing(self.connect()) as connection, connection:
             assert connection.execute(statement, parameters).rowcount != 0, "nothing was changed"
 
+    def run_script(self, statements: str) -> None:
+        """Creates the database, if missing, and executes statements of SQL."""
+        self.data_dir.mkdir(exist_ok=True)
+        with closing(self.connect()) as connection:
+            connection.executescript(statements)
+
+    def inspected(self) -> AbstractContextManager[Connection]:
+        """A connection that reflects the schema."""
+        return connected(sqlite.create_sqlite_engine(self.data_dir / DATABASE_FILE))
+
     def connect(self) -> Any:
         """With the store's own library: another one in the same process would neither see nor keep its locks."""
         return sqlite.choose_library().connect(self.data_dir / DATABASE_FILE, timeout=0)
@@ -72,6 +83,25 @@ class Shared:
     def execute(self, statement: str, *parameters: object) -> None:
         with psycopg.connect(self.url) as connection:
             assert connection.execute(_in_psycopg(statement), parameters).rowcount != 0, "nothing was changed"
+
+    def run_script(self, statements: str) -> None:
+        """Executes statements of SQL."""
+        with psycopg.connect(self.url) as connection:
+            connection.execute(_in_psycopg(statements))
+
+    def inspected(self) -> AbstractContextManager[Connection]:
+        """A connection that reflects the schema, which it does not of what is sent in binary."""
+        return connected(postgresql._create_engine(postgresql.parse_url(self.url), cursors_are_binary=False))
+
+
+@contextmanager
+def connected(engine: Engine) -> Iterator[Connection]:
+    """A connection of an engine that is used for nothing else."""
+    try:
+        with engine.connect() as connection:
+            yield connection
+    finally:
+        engine.dispose()
 
 
 Place: TypeAlias = Folder | Shared

@@ -22,7 +22,6 @@ from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
 from mapless_server.method.pairs.pair import in_order
 from mapless_server.store import Store
-from mapless_server.store.compaction import compact_features
 from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress, delete_unused, record_use
 
 from .calibration.calibrator import SceneCalibrations
@@ -195,9 +194,6 @@ class BackgroundMatching:
             self._agreements.derive_all()
         record_use(self._store.database, used)
         delete_unused(self._store.database, self._pause)
-        rewritten = set(compact_features(self._store.database, self._pause))
-        if rewritten:
-            self._store.reference_cache.forget(lambda key, _: key in rewritten)
         self._use_is_due_s = time.monotonic() + _USE_IS_RECORDED_S
 
     def _run(self, work: Callable[[], None]) -> None:

@@ -50,10 +50,15 @@ def back_up(database: Database, path: Path, on_progress: Progress = ignore_progr
                 database.lift_limits(source)
                 version = read_version(source)  # from here on, the transaction sees one moment
                 assert version is not None
+                if version != SCHEMA_VERSION and source.dialect.name != "sqlite":
+                    raise ValueError(
+                        f"its schema has version {version}, this release writes {SCHEMA_VERSION}; make the backup with "
+                        "the release that uses the database, or run `mapless-server store migrate` first"
+                    )
                 if source.dialect.name == "sqlite":
                     _copy_pages(source, unfinished, on_progress)
                 else:
-                    _copy_rows_to_file(source, version, unfinished, on_progress)
+                    _copy_rows_to_file(source, unfinished, on_progress)
                 found = _verify_copy(source, unfinished, on_progress)
             _sync(unfinished)
             unfinished.rename(path)
@@ -108,8 +113,8 @@ def _copy_pages(source: Connection, path: Path, on_progress: Progress) -> None:
         target.execute("PRAGMA journal_mode=DELETE")  # one file, which can be read where nothing can be written
 
 
-def _copy_rows_to_file(source: Connection, version: int, path: Path, on_progress: Progress) -> None:
-    with closing(SqliteDatabase.open_scratch(path, version)) as database, database.write() as target:
+def _copy_rows_to_file(source: Connection, path: Path, on_progress: Progress) -> None:
+    with closing(SqliteDatabase.open_scratch(path)) as database, database.write() as target:
         _copy_rows(source, target, _tables_of(target, (store_version, alembic_version)), on_progress)
 
 

@@ -30,7 +30,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MICROSECOND = timedelta(microseconds=1)
 
 SMALL_FEATURES = "+8bit"
-"""Suffix of the extractor in the table `features`: servers of 0.2.0 do not find these, and so find none damaged."""
+"""Suffix of the extractor in the table `features` where descriptors have 8 bits, which 0.2.0 cannot read."""
 
 
 def time_us(time: datetime) -> int:
@@ -148,7 +148,7 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
 
 
 def feature_names(extractor: str) -> tuple[str, str]:
-    """Names under which an extractor's features are stored: in 8 bits, and as float32 by version 0.2.0."""
+    """Names under which an extractor's features are stored: in 8 bits, and as float32, as 0.2.0 did."""
     return extractor + SMALL_FEATURES, extractor
 
 

@@ -125,12 +125,12 @@ class SqliteDatabase:
         return database
 
     @staticmethod
-    def open_scratch(path: Path, version: int = SCHEMA_VERSION) -> SqliteDatabase:
+    def open_scratch(path: Path) -> SqliteDatabase:
         """Opens a file that may be lost until it is complete, without waiting for the disk; creates it if missing.
 
         StoreError as in `open`.
         """
-        return SqliteDatabase._opened(path, None, version, is_scratch=True)
+        return SqliteDatabase._opened(path, None, is_scratch=True)
 
     @staticmethod
     def open_as_is(path: Path) -> SqliteDatabase:
@@ -147,12 +147,10 @@ class SqliteDatabase:
         return database
 
     @staticmethod
-    def _opened(
-        path: Path, folder_lock: FolderLock | None, version: int = SCHEMA_VERSION, is_scratch: bool = False
-    ) -> SqliteDatabase:
+    def _opened(path: Path, folder_lock: FolderLock | None, is_scratch: bool = False) -> SqliteDatabase:
         database = SqliteDatabase(create_sqlite_engine(path, is_scratch=is_scratch), folder_lock)
         with database._faults_as_store_errors():
-            database._migrate(version)
+            database._migrate()
         return database
 
     @contextmanager
@@ -173,15 +171,18 @@ class SqliteDatabase:
             self.close()
             raise
 
-    def _migrate(self, version: int) -> None:
+    def _migrate(self) -> None:
         with self._writing_engine.connect() as connection:
             # Where SQLite cannot alter a table, the table is replaced, and dropping the old one must not delete what
             # refers to it. The setting has an effect outside of transactions only.
             _execute(connection, "PRAGMA foreign_keys=OFF")
             try:
                 with connection.begin():
-                    found = migrate(connection, version)
-                    if found not in (None, version) and connection.exec_driver_sql("PRAGMA foreign_key_check").first():
+                    found = migrate(connection)
+                    if (
+                        found not in (None, SCHEMA_VERSION)
+                        and connection.exec_driver_sql("PRAGMA foreign_key_check").first()
+                    ):
                         raise ValueError("a part of it refers to what is not there")
             finally:
                 _execute(connection, "PRAGMA foreign_keys=ON")

@@ -7,11 +7,11 @@ each in a release of its own, and at every moment the servers of the last two re
 2. *Migrate*: fill what was added, in the same step if it is quick; new servers write both, and read the new.
 3. *Contract*: remove what no server of the last release uses.
 
-A released step is never edited: a change is a new file. A server refuses to open a schema newer than its own, since it
-cannot know what it would have to keep up to date; a server that has it open already works on through an expansion. A
-step's revision is the number of the schema, which it also writes into `store_version`, for programs without alembic.
-
-Revision 2 keeps counts that servers of revision 1 would not: revision 1 was on SQLite only, where no second server is.
+A step's revision is the number of the schema, which is also in `store_version`, for programs without alembic. A
+released step is never edited: a change is a new file. The steps begin at the schema of 0.2.0; an older store, or one of
+a version between releases, is refused with the release that can bring it up to date. A newer one is refused, since a
+server cannot know what it would have to keep up to date; a server that has it open already works on through an
+expansion.
 """
 
 import logging
@@ -21,6 +21,9 @@ from sqlalchemy import Connection, insert, inspect, select
 from ..tables import SCHEMA_VERSION, alembic_version, metadata, store_version
 
 log = logging.getLogger(__name__)
+
+FIRST_VERSION = 3
+"""The schema of 0.2.0, at which the steps begin."""
 
 
 def read_version(connection: Connection) -> int | None:
@@ -37,41 +40,46 @@ def read_version(connection: Connection) -> int | None:
     if found is None:
         raise ValueError("it is a database of another program")
     if found > SCHEMA_VERSION:
-        raise ValueError(f"its schema has version {found}, this program knows versions up to {SCHEMA_VERSION}")
+        raise ValueError(
+            f"a newer release has written it: its schema has version {found}, this release knows versions up to "
+            f"{SCHEMA_VERSION}; use that release, or restore a backup from before the upgrade"
+        )
     return found
 
 
-def migrate(connection: Connection, to_version: int = SCHEMA_VERSION) -> int | None:
+def migrate(connection: Connection) -> int | None:
     """Migrates a database in the connection's transaction, which must be the only one; returns its version before.
 
-    An empty database, whose version is None, gets the current schema at once, which is quicker; a test checks that the
-    steps lead to the same schema. Only copies of older databases need another version. ValueError as in `read_version`.
+    An empty database, whose version is None, gets the current schema; a test checks that the steps lead to the same.
+    ValueError as in `read_version`, or if no step begins at the version.
     """
     found = read_version(connection)
-    if found is None and to_version == SCHEMA_VERSION:
+    if found is None:
         metadata.create_all(connection)
-        write_version(connection, SCHEMA_VERSION)
         connection.execute(insert(alembic_version).values(version_num=str(SCHEMA_VERSION)))
-    elif found is None or found < to_version:
-        run_steps(connection, found, to_version)
-        log.info("the store's schema was brought from version %s to %d", found, to_version)
+    elif found < SCHEMA_VERSION:
+        _run_steps(connection, found)
+        log.info("the store's schema was brought from version %d to %d", found, SCHEMA_VERSION)
+    if found != SCHEMA_VERSION:
+        connection.execute(store_version.delete())
+        connection.execute(insert(store_version).values(schema_version=SCHEMA_VERSION))
     return found
 
 
-def run_steps(connection: Connection, from_version: int | None, to_version: int) -> None:
-    """Runs the steps from one version (None: an empty database) to another, in the connection's transaction."""
+def _run_steps(connection: Connection, found: int) -> None:
     from alembic import command
     from alembic.config import Config
+    from alembic.script import ScriptDirectory
 
     config = Config()
     config.set_main_option("script_location", "mapless_server.store:migrations")
     config.attributes["connection"] = connection
-    if from_version is not None and not inspect(connection).has_table(alembic_version.name):
-        command.stamp(config, str(from_version))  # from before alembic was used
-    command.upgrade(config, str(to_version))
-
-
-def write_version(connection: Connection, version: int) -> None:
-    """Records the version; the last thing that a step does."""
-    connection.execute(store_version.delete())
-    connection.execute(insert(store_version).values(schema_version=version))
+    known = {FIRST_VERSION} | {int(step.revision) for step in ScriptDirectory.from_config(config).walk_revisions()}
+    if found not in known:
+        raise ValueError(
+            f"its schema has version {found}, which lies before release 0.2.0 or between releases; run "
+            "`mapless-server store migrate` of release 0.3.0 first"
+        )
+    if found == FIRST_VERSION:
+        command.stamp(config, "base", purge=True)  # the step that led to it is no longer here
+    command.upgrade(config, "head")

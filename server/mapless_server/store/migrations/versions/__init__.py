@@ -1,1 +1,1 @@
-"""The steps, by number."""
+"""The steps, by the revision to which they lead."""

@@ -1,20 +1,18 @@
-"""Features in 8 bits: what they cost, what they round, and how those stored as float32 become them."""
+"""Features in 8 bits: what they cost, what they round, and that they are preferred to those in float32."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.stores import EXTRACTOR, Place, assert_same_bits, faults_of, make_features, make_reference, view_of
+from support.stores import EXTRACTOR, Place, assert_same_bits, make_features, make_reference, view_of
 
 from mapless.geometry import Camera
-from mapless_server.errors import AlreadyExists
 from mapless_server.method.features.views import Features, View, rounded_descriptors
 from mapless_server.security import SceneKey
 from mapless_server.store import Store, codec
-from mapless_server.store.compaction import compact_features, in_8_bits
 
-OFFICE, HALL, SCENE, NOWHERE = map(SceneKey, ("office", "hall", "scene", "nowhere"))
+OFFICE = SceneKey("office")
 CAMERA = Camera.from_fov(640, 480, 70.0)
 
 
@@ -79,23 +77,6 @@ def test_bytes_cut_short_are_damaged() -> None:
         codec.decode_view("o", blob, codec.sha256_for("o", blob))
 
 
-def test_histograms_are_found_again_to_the_last_bit() -> None:
-    features = small_features(5, 300, 128, is_histogram=True)
-    floats = replace(features, descriptors=features.unit_descriptors())
-    small = in_8_bits(floats)
-    assert_same_bits(small.descriptors, features.descriptors)
-    assert_same_bits(small.unit_descriptors(), floats.descriptors)
-
-
-@pytest.mark.parametrize("odd", [0.0, np.nan])
-def test_odd_descriptors_are_no_obstacle(odd: float) -> None:
-    descriptors = np.abs(np.random.default_rng(6).normal(size=(4, 64))).astype(np.float32)
-    descriptors[2] = odd
-    small = in_8_bits(replace(small_features(6, 4, 64), descriptors=descriptors))
-    assert small.descriptors.dtype.itemsize == 1
-    assert not small.unit_descriptors()[2].any()
-
-
 def test_cosines_of_rounded_descriptors_are_close() -> None:
     random = np.random.default_rng(7)
     exact = random.normal(size=(200, 64))
@@ -106,30 +87,10 @@ def test_cosines_of_rounded_descriptors_are_close() -> None:
     assert np.abs(unit @ unit.T - exact @ exact.T).max() < 0.01
 
 
-def test_float32_features_become_8_bits_while_the_store_is_used(store: Store, place: Place) -> None:
-    store.create_scene(OFFICE)
-    made = [make_reference(f"r{i}", i) for i in range(3)]
-    records = store.add_references(OFFICE, made)
-    place.execute("UPDATE features SET data = ? WHERE reference_key = ?", b"damaged", records[2].key)
-    with store.uncached() as other:
-        assert {key for key, _ in compact_features(store.database, lambda: None)} == {it.key for it in records[:2]}
-        for reader in (store, other):
-            found = reader.load_references(OFFICE, ["r0", "r1"], EXTRACTOR).references
-            for described, new in zip(found, made, strict=False):
-                if reader is other:
-                    assert_same_bits(described.view.features.descriptors, in_8_bits(view_of(new).features).descriptors)
-    assert sorted(place.fetch("SELECT extractor FROM features")) == [("sift",), ("sift+8bit",), ("sift+8bit",)]
-    assert compact_features(store.database, lambda: None) == []
-    assert len(faults_of(place)) == 1
-    assert store.has_features(records[0].key, EXTRACTOR)
-    with pytest.raises(AlreadyExists):
-        store.add_features(records[0].key, EXTRACTOR, view_of(made[0]))
-
-
 def test_8_bits_are_read_where_an_older_server_added_float32(store: Store, place: Place) -> None:
     store.create_scene(OFFICE)
     new = make_reference("r")
-    small = replace(view_of(new), features=in_8_bits(view_of(new).features))
+    small = replace(view_of(new), features=small_features(1, 20, 64))
     (record,) = store.add_references(OFFICE, [replace(new, views={EXTRACTOR: small})])
     blob = codec.encode_view(view_of(new))
     place.execute(
@@ -138,14 +99,3 @@ def test_8_bits_are_read_where_an_older_server_added_float32(store: Store, place
     )
     (found,) = store.load_references(OFFICE, ["r"], EXTRACTOR).references
     assert_same_bits(found.view.features.descriptors, small.features.descriptors)
-    compact_features(store.database, lambda: None)
-    assert place.fetch("SELECT extractor FROM features") == [("sift+8bit",)]
-
-
-def test_compaction_stops_at_the_given_place(store: Store, place: Place) -> None:
-    store.create_scene(OFFICE)
-    store.add_references(OFFICE, [make_reference(f"r{i}", i) for i in range(3)])
-    steps = iter([None, None])
-    with pytest.raises(StopIteration):
-        compact_features(store.database, lambda: next(steps))
-    assert sorted(place.fetch("SELECT extractor FROM features")) == [("sift",), ("sift+8bit",), ("sift+8bit",)]

@@ -1,0 +1,141 @@
+-- A store as release 0.3.0 has written it to PostgreSQL.
+CREATE TABLE alembic_version (
+    version_num character varying(32) NOT NULL
+);
+CREATE TABLE features (
+    reference_key character varying(32) NOT NULL,
+    extractor character varying(128) NOT NULL,
+    data bytea NOT NULL,
+    sha256 character varying(64) NOT NULL
+);
+CREATE TABLE global_descriptor (
+    reference_key character varying(32) NOT NULL,
+    name character varying(128) NOT NULL,
+    data bytea NOT NULL,
+    sha256 character varying(64) NOT NULL
+);
+CREATE TABLE image (
+    reference_key character varying(32) NOT NULL,
+    data bytea NOT NULL
+);
+CREATE TABLE mask (
+    reference_key character varying(32) NOT NULL,
+    data bytea NOT NULL
+);
+CREATE TABLE matching_use (
+    matching character varying(255) NOT NULL,
+    used_time_us bigint NOT NULL
+);
+CREATE TABLE reference (
+    key character varying(32) NOT NULL,
+    scene_id character varying(257) NOT NULL COLLATE pg_catalog."C",
+    reference_id character varying(128) NOT NULL COLLATE pg_catalog."C",
+    geometry bytea NOT NULL,
+    geometry_sha256 character varying(64) NOT NULL,
+    image_sha256 character varying(64) NOT NULL,
+    feature_count integer NOT NULL,
+    create_time_us bigint NOT NULL,
+    generation bigint DEFAULT 0 NOT NULL,
+    mask_sha256 character varying(64)
+);
+CREATE TABLE reference_depth (
+    reference_key character varying(32) NOT NULL,
+    kind character varying(255) NOT NULL,
+    data bytea NOT NULL,
+    sha256 character varying(64) NOT NULL
+);
+CREATE TABLE reference_matching (
+    reference_key character varying(32) NOT NULL,
+    matching character varying(255) NOT NULL,
+    due_time_us bigint,
+    failure_count integer DEFAULT 0 NOT NULL
+);
+CREATE TABLE reference_pair (
+    first_key character varying(32) NOT NULL,
+    second_key character varying(32) NOT NULL,
+    matching character varying(255) NOT NULL,
+    data bytea NOT NULL,
+    sha256 character varying(64) NOT NULL,
+    error_px double precision
+);
+CREATE TABLE removed_reference (
+    scene_id character varying(257) NOT NULL COLLATE pg_catalog."C",
+    generation bigint NOT NULL,
+    reference_key character varying(32) NOT NULL
+);
+CREATE TABLE scene (
+    scene_id character varying(257) NOT NULL COLLATE pg_catalog."C",
+    create_time_us bigint NOT NULL,
+    reference_count bigint DEFAULT 0 NOT NULL,
+    first_generation bigint DEFAULT 0 NOT NULL,
+    attributes bytea,
+    attributes_sha256 character varying(64)
+);
+CREATE TABLE scene_calibration (
+    scene_id character varying(257) NOT NULL COLLATE pg_catalog."C",
+    kind character varying(255) NOT NULL,
+    generation bigint,
+    due_time_us bigint NOT NULL,
+    failure_count integer DEFAULT 0 NOT NULL,
+    data bytea,
+    sha256 character varying(64)
+);
+CREATE TABLE scene_generation (
+    scene_id character varying(257) NOT NULL COLLATE pg_catalog."C",
+    generation bigint NOT NULL
+);
+CREATE TABLE store_version (
+    schema_version integer NOT NULL
+);
+INSERT INTO alembic_version VALUES ('9');
+INSERT INTO features VALUES ('122a7536883743f48633cf2c9740e2a7', 'sift+8bit', '\x02000000e80000007b2263616d657261223a7b2277696474685f7078223a36342c226865696768745f7078223a34382c22666f63616c5f785f7078223a35302e32352c22666f63616c5f795f7078223a35312e302c227072696e636970616c5f785f7078223a33312e352c227072696e636970616c5f795f7078223a32332e352c22646973746f7274696f6e223a6e756c6c7d2c22636f756e74223a342c2264696d656e73696f6e223a382c226b696e64223a22686973746f6772616d222c226f726967696e223a5b302e302c302e305d2c2273746570223a342e3736383337313538323033313235652d30377d20200000000000200000400000600000800000a00000c00000e000400040004000406400000000000000006400000000000000006400000000000000006400000000', '13f67ab6ba11ccf1a0453363a4b0ffc87b03d36b1c86e452431f4535e19c7be5');
+INSERT INTO features VALUES ('ad56d97f8cc14832815c0dc2eb831d83', 'sift+8bit', '\x02000000e80000007b2263616d657261223a7b2277696474685f7078223a36342c226865696768745f7078223a34382c22666f63616c5f785f7078223a35312e32352c22666f63616c5f795f7078223a35312e302c227072696e636970616c5f785f7078223a33312e352c227072696e636970616c5f795f7078223a32332e352c22646973746f7274696f6e223a6e756c6c7d2c22636f756e74223a342c2264696d656e73696f6e223a382c226b696e64223a22686973746f6772616d222c226f726967696e223a5b302e302c302e305d2c2273746570223a342e3736383337313538323033313235652d30377d20200000080000280000480000680000880000a80000c80000e800420042004200420064000000000000000064000000000000000064000000000000000064000000', '7e062b3d85ebb038da86f04ccef44ab840c037fe0ac9022113d7449e25409efe');
+INSERT INTO features VALUES ('66934eab9dd44af7bb075cd73fa6df99', 'sift+8bit', '\x02000000e80000007b2263616d657261223a7b2277696474685f7078223a36342c226865696768745f7078223a34382c22666f63616c5f785f7078223a35322e32352c22666f63616c5f795f7078223a35312e302c227072696e636970616c5f785f7078223a33312e352c227072696e636970616c5f795f7078223a32332e352c22646973746f7274696f6e223a6e756c6c7d2c22636f756e74223a342c2264696d656e73696f6e223a382c226b696e64223a22686973746f6772616d222c226f726967696e223a5b302e302c302e305d2c2273746570223a342e3736383337313538323033313235652d30377d20200000100000300000500000700000900000b00000d00000f000440044004400440000640000000000000000640000000000000000640000000000000000640000', '6daca55724d3d0ef392c8745aa03fe2f1da3bdc1ebf5a88aab34f38c413378a2');
+INSERT INTO global_descriptor VALUES ('122a7536883743f48633cf2c9740e2a7', 'vlad', '\x003c000000000000', '50bd8bd01bb4b33617ca3021a85bb15977fcdabc9653953b1d6843e4d908b4f6');
+INSERT INTO global_descriptor VALUES ('ad56d97f8cc14832815c0dc2eb831d83', 'vlad', '\x0000003c00000000', '306a15b9adcfd735b61d4f8da0e7640269ea876b4d698a661b636eb14bf2a5ed');
+INSERT INTO global_descriptor VALUES ('66934eab9dd44af7bb075cd73fa6df99', 'vlad', '\x00000000003c0000', '51d2580ce063cb11b438eca80e40a364ab99980af375b6bde9bf36ab13fb5b2e');
+INSERT INTO image VALUES ('122a7536883743f48633cf2c9740e2a7', '\x0000000000000000');
+INSERT INTO image VALUES ('ad56d97f8cc14832815c0dc2eb831d83', '\x0101010101010101');
+INSERT INTO image VALUES ('66934eab9dd44af7bb075cd73fa6df99', '\x0202020202020202');
+INSERT INTO mask VALUES ('66934eab9dd44af7bb075cd73fa6df99', '\x6d61736b');
+INSERT INTO reference VALUES ('122a7536883743f48633cf2c9740e2a7', 'office', 'a', '\x7b2263616d657261223a7b2277696474685f7078223a36342c226865696768745f7078223a34382c22666f63616c5f785f7078223a35302e32352c22666f63616c5f795f7078223a35312e302c227072696e636970616c5f785f7078223a33312e352c227072696e636970616c5f795f7078223a32332e352c22646973746f7274696f6e223a6e756c6c7d2c22776f726c645f66726f6d5f63616d657261223a7b22726f746174696f6e223a5b5b312e302c302e302c302e305d2c5b302e302c312e302c302e305d2c5b302e302c302e302c312e305d5d2c227472616e736c6174696f6e223a5b302e302c322e352c2d312e305d7d7d', '6c0d9d6b8f25e44ffd0e911ee52b15c69353a71a7bed8ed4c8903c4355efbf89', 'af5570f5a1810b7af78caf4bc70a660f0df51e42baf91d4de5b2328de0e83dfc', 4, 1795931771846912, 2, NULL);
+INSERT INTO reference VALUES ('ad56d97f8cc14832815c0dc2eb831d83', 'office', 'b', '\x7b2263616d657261223a7b2277696474685f7078223a36342c226865696768745f7078223a34382c22666f63616c5f785f7078223a35312e32352c22666f63616c5f795f7078223a35312e302c227072696e636970616c5f785f7078223a33312e352c227072696e636970616c5f795f7078223a32332e352c22646973746f7274696f6e223a6e756c6c7d2c22776f726c645f66726f6d5f63616d657261223a7b22726f746174696f6e223a5b5b302e302c302e302c312e305d2c5b312e302c302e302c302e305d2c5b302e302c312e302c302e305d5d2c227472616e736c6174696f6e223a5b312e302c322e352c2d312e305d7d7d', 'bc539aeecec6b994f38e5fab24e163a9c1bec1f7a60aa83d8dddf052e66faad1', '04abc8821a06e5a30937967d11ad10221cb5ac3b5273e434f1284ee87129a061', 4, 1795931771846912, 2, NULL);
+INSERT INTO reference VALUES ('66934eab9dd44af7bb075cd73fa6df99', 'office', 'c', '\x7b2263616d657261223a7b2277696474685f7078223a36342c226865696768745f7078223a34382c22666f63616c5f785f7078223a35322e32352c22666f63616c5f795f7078223a35312e302c227072696e636970616c5f785f7078223a33312e352c227072696e636970616c5f795f7078223a32332e352c22646973746f7274696f6e223a6e756c6c7d2c22776f726c645f66726f6d5f63616d657261223a7b22726f746174696f6e223a5b5b302e302c312e302c302e305d2c5b302e302c302e302c312e305d2c5b312e302c302e302c302e305d5d2c227472616e736c6174696f6e223a5b322e302c322e352c2d312e305d7d7d', 'b166b8a7c4eb72ce43391394605ffd1b33645e2b3d39ef72f9c31591e403345e', '10ae0fdbf8c4f1f2b5e708fd7478abd2bf03b190edc878dc62ada645aa7e0310', 4, 1795931771846912, 2, '48bf9b4f142ab45cac6f33cf99415bca6ca8e07608a031237aa76560fec2204b');
+INSERT INTO reference_matching VALUES ('66934eab9dd44af7bb075cd73fa6df99', 'nearest', NULL, 0);
+INSERT INTO reference_pair VALUES ('122a7536883743f48633cf2c9740e2a7', 'ad56d97f8cc14832815c0dc2eb831d83', 'nearest', '\x00000000010000000200000003000000', '7b7399dadca6adc735a190b5236b2f1170d0ec60033932430cb3fa60686e5245', 0.5);
+INSERT INTO removed_reference VALUES ('office', 3, '66a980e8c35944719146c7a586ae9c58');
+INSERT INTO scene VALUES ('office', 1795931771832440, 3, 1, '\x7b22646174756d223a6e756c6c2c22646f776e5f696e5f776f726c64223a5b302e302c302e302c2d312e305d2c2263616c6962726174696f6e223a6e756c6c2c226172626974726172795f756e6974223a66616c73657d', '081d036ab5af3ac736ae03e8bfda691d5044f483150c4b36e10c2911de3e6378');
+INSERT INTO scene VALUES ('empty', 1795931771892036, 0, 1, NULL, NULL);
+INSERT INTO scene_generation VALUES ('office', 3);
+INSERT INTO scene_generation VALUES ('empty', 1);
+INSERT INTO store_version VALUES (9);
+ALTER TABLE alembic_version ADD CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num);
+ALTER TABLE features ADD CONSTRAINT features_pkey PRIMARY KEY (reference_key, extractor);
+ALTER TABLE global_descriptor ADD CONSTRAINT global_descriptor_pkey PRIMARY KEY (reference_key, name);
+ALTER TABLE image ADD CONSTRAINT image_pkey PRIMARY KEY (reference_key);
+ALTER TABLE mask ADD CONSTRAINT mask_pkey PRIMARY KEY (reference_key);
+ALTER TABLE matching_use ADD CONSTRAINT matching_use_pkey PRIMARY KEY (matching);
+ALTER TABLE reference_depth ADD CONSTRAINT reference_depth_pkey PRIMARY KEY (reference_key, kind);
+ALTER TABLE reference_matching ADD CONSTRAINT reference_matching_pkey PRIMARY KEY (reference_key, matching);
+ALTER TABLE reference_pair ADD CONSTRAINT reference_pair_pkey PRIMARY KEY (first_key, second_key, matching);
+ALTER TABLE reference ADD CONSTRAINT reference_pkey PRIMARY KEY (key);
+ALTER TABLE reference ADD CONSTRAINT reference_scene_id_reference_id_key UNIQUE (scene_id, reference_id);
+ALTER TABLE removed_reference ADD CONSTRAINT removed_reference_pkey PRIMARY KEY (scene_id, generation, reference_key);
+ALTER TABLE scene_calibration ADD CONSTRAINT scene_calibration_pkey PRIMARY KEY (scene_id, kind);
+ALTER TABLE scene_generation ADD CONSTRAINT scene_generation_pkey PRIMARY KEY (scene_id);
+ALTER TABLE scene ADD CONSTRAINT scene_pkey PRIMARY KEY (scene_id);
+ALTER TABLE store_version ADD CONSTRAINT store_version_pkey PRIMARY KEY (schema_version);
+CREATE INDEX reference_by_generation ON reference USING btree (scene_id, generation);
+CREATE INDEX reference_matching_by_due_time ON reference_matching USING btree (matching, due_time_us);
+CREATE INDEX reference_pair_by_second ON reference_pair USING btree (second_key);
+ALTER TABLE features ADD CONSTRAINT features_reference_key_fkey FOREIGN KEY (reference_key) REFERENCES reference(key) ON DELETE CASCADE;
+ALTER TABLE global_descriptor ADD CONSTRAINT global_descriptor_reference_key_fkey FOREIGN KEY (reference_key) REFERENCES reference(key) ON DELETE CASCADE;
+ALTER TABLE image ADD CONSTRAINT image_reference_key_fkey FOREIGN KEY (reference_key) REFERENCES reference(key) ON DELETE CASCADE;
+ALTER TABLE mask ADD CONSTRAINT mask_reference_key_fkey FOREIGN KEY (reference_key) REFERENCES reference(key) ON DELETE CASCADE;
+ALTER TABLE reference_depth ADD CONSTRAINT reference_depth_reference_key_fkey FOREIGN KEY (reference_key) REFERENCES reference(key) ON DELETE CASCADE;
+ALTER TABLE reference_matching ADD CONSTRAINT reference_matching_reference_key_fkey FOREIGN KEY (reference_key) REFERENCES reference(key) ON DELETE CASCADE;
+ALTER TABLE reference_pair ADD CONSTRAINT reference_pair_first_key_fkey FOREIGN KEY (first_key) REFERENCES reference(key) ON DELETE CASCADE;
+ALTER TABLE reference_pair ADD CONSTRAINT reference_pair_second_key_fkey FOREIGN KEY (second_key) REFERENCES reference(key) ON DELETE CASCADE;
+ALTER TABLE reference ADD CONSTRAINT reference_scene_id_fkey FOREIGN KEY (scene_id) REFERENCES scene(scene_id) ON DELETE CASCADE;
+ALTER TABLE removed_reference ADD CONSTRAINT removed_reference_scene_id_fkey FOREIGN KEY (scene_id) REFERENCES scene(scene_id) ON DELETE CASCADE;
+ALTER TABLE scene_calibration ADD CONSTRAINT scene_calibration_scene_id_fkey FOREIGN KEY (scene_id) REFERENCES scene(scene_id) ON DELETE CASCADE;
