@@ -15,7 +15,6 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 
 OUTSIDE = {
-    "BENCHMARKS.md": "benchmarks/index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security-reports.md",
@@ -24,7 +23,7 @@ OUTSIDE = {
     "deploy/envoy/README.md": "operation/envoy.md",
     "deploy/ray/README.md": "operation/ray.md",
     "deploy/ray/kubernetes/README.md": "operation/ray-kubernetes.md",
-    "server/research/README.md": "benchmarks/research.md",
+    "server/research/README.md": "research.md",
 }
 """Pages of the site that lie outside docs/, by their path in the repository."""
 

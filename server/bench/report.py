@@ -1,6 +1,6 @@
 """The scenes of the benchmark, the target on each and the accuracy that a map reaches, latency, and the report.
 
-For people it is Markdown, as in BENCHMARKS.md, and for programs JSON.
+For people it is Markdown, for programs JSON, from which `bench.results` takes the tables of docs/results.md.
 """
 
 import tempfile

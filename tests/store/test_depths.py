@@ -69,7 +69,7 @@ def test_depths_that_are_not_above_0_are_refused(value: float) -> None:
 
 
 def test_a_smooth_map_takes_a_seventh_of_a_byte_a_pixel() -> None:
-    """A network's map at 518x392 takes 34 KB with noise of 1 %, see BENCHMARKS."""
+    """A network's map at 518x392 takes 34 KB with noise of 1 %."""
     camera = CAMERA.resized(512, 384)
     row, column = np.indices((384, 512))
     depth = (2.0 + 0.002 * column + 0.001 * row).astype(np.float32)

@@ -17,7 +17,7 @@ TARGET_QUEUED_S = 0.5
 """A quarter of what a replica admits by default (`max_queued_s`): callers wait half a second more, and calls that
 arrive before new replicas are warm are still admitted."""
 TARGET_BUSY = 0.7
-"""Above it, queues grow steeply; see BENCHMARKS.md, "Under load"."""
+"""Above it, queues grow steeply; see docs/results.md, "Load"."""
 
 
 class Load(Protocol):

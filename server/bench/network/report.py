@@ -1,4 +1,4 @@
-"""The figures: a table for people, JSON for programs, Markdown for BENCHMARKS.md."""
+"""The figures: a table for people, JSON for programs, Markdown."""
 
 import textwrap
 from collections.abc import Sequence

@@ -42,11 +42,11 @@ from .search import Search
 log = logging.getLogger(__name__)
 
 SHORTLIST = 2
-"""So many times the references wanted are matched with a sample of the photograph, and the best of them used (see
-BENCHMARKS.md)."""
+"""Factor on the references wanted: that many are matched with a sample of the photograph, and the best of them used.
+Decision: 025-choosing-references."""
 
 ALONE_BY_CHANCE = LEAST_AGREEMENT - PROMISE.agreement
-"""By so much the agreement of one reference exceeds that of two, where both are as likely by chance."""
+"""Difference of the agreement of one reference and of two where both are as likely by chance."""
 
 MIRROR_REFERENCES = 5
 """A photograph and its mirror image are compared with so many references, the most similar, or with all named ones."""
