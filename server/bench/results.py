@@ -90,12 +90,13 @@ def scenes_of_maps(rows: list[Row]) -> Iterable[list[str]]:
 
 
 def _outcome(row: Row) -> str:
-    """Median error, with how many were localized where some were not or are wrong."""
+    """Median error; in brackets how many are localized where not all are, and how many of them are wrong."""
     found, asked, wrong = row["localized"], row["queries"], row["wrong"]
-    error = "lost" if row["median"] is None else f"{row['median']:{DIGITS[row['unit']]}} {row['unit']}"
+    error = "" if row["median"] is None else f"{row['median']:{DIGITS[row['unit']]}} {row['unit']}"
     error += "" if row["median_deg"] is None else f" / {row['median_deg']:.3f}°"
-    count = f", {found} of {asked}" if found < asked or wrong else ""
-    return error + count + (f", {wrong} wrong" if wrong else "")
+    counts = [f"{found} of {asked}"] if found < asked else []
+    counts += [f"{wrong} wrong"] if wrong else []
+    return f"{error} ({', '.join(counts)})".strip() if counts else error
 
 
 def unseen(rows: list[Row]) -> Iterable[list[str]]:

@@ -52,8 +52,8 @@ def test_new_figures_replace_those_of_the_same_scene(tmp_path: Path, monkeypatch
         rows = results.taken(measured, with_latency=False)["accuracy"]
         results.store("accuracy", [row | {"commit": commit, "date": "2026-11-29"} for row in rows])
     lines = results.table("accuracy").splitlines()
-    assert lines[2] == "| hall | 5 |  | 0.35 cm / 0.123°, 3 of 4, 1 wrong | 11111111 |"
-    assert lines[3] == "| fox | leave one out | 0.100 % / 0.123°, 3 of 4, 1 wrong |  | 11111111 |"
+    assert lines[2] == "| hall | 5 |  | 0.35 cm / 0.123° (3 of 4, 1 wrong) | 11111111 |"
+    assert lines[3] == "| fox | leave one out | 0.100 % / 0.123° (3 of 4, 1 wrong) |  | 11111111 |"
     assert lines[5] == "Measured by `make bench`; commits 11111111 (2026-11-29); one."
 
 
