@@ -138,7 +138,7 @@ def load(rows: list[Row]) -> Iterable[list[str]]:
 
 
 def serving(rows: list[Row]) -> Iterable[list[str]]:
-    """What was measured beside the load."""
+    """A line for each figure with its bar."""
     yield ["figure", "measured", "bar", "commit"]
     for row in rows:
         yield [row["figure"], row["value"], row["bar"] or "", row["commit"]]

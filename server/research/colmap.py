@@ -78,7 +78,7 @@ class Case:
 
     @property
     def file_name(self) -> str:
-        """Of its results."""
+        """Name of the file with its results."""
         return f"{self.scene}.json" if self.references is None else f"{self.scene}-{self.references}.json"
 
 
@@ -260,7 +260,7 @@ def measure(dataset: Dataset, case: Case, database: SceneDatabase) -> dict[str, 
 
 
 def cells_of(content: Mapping[str, Any], distances: Mapping[str, float]) -> list[str]:
-    """What a result file says: how many are localized, how many of these wrongly, medians, and seconds of a query.
+    """Cells of a result file: how many are localized, how many of these wrongly, medians, and seconds of a query.
 
     Wrong ones are off by more than `RIGHT_M`, or `RIGHT_SHARE` of the distance to the references (by the query's name)
     where the unit is arbitrary, or by more than `RIGHT_DEG`. A median is infinite where half of the queries are lost.

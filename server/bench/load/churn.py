@@ -31,15 +31,15 @@ from .sender import MAX_MESSAGE_BYTES
 ONCE = ConnectOptions(max_attempts=1, timeout_s=20.0)
 """The outcome of each call is counted, not that of a retry."""
 EXTRA_REFERENCES = 4
-"""Of the scene that is queried, at a time: added in turn, the oldest deleted."""
+"""Number of references at a time beside those of the queried scene: added in turn, the oldest deleted."""
 SCENES = 5
 """Ids that scenes are created with, again and again: a scene's generation is kept for ever."""
 ENDING_S = 120.0
 """For workers to finish: their calls have deadlines."""
 BUSY = frozenset({"RESOURCE_EXHAUSTED", "DEADLINE_EXCEEDED"})
-"""What a server may answer any call at its limit."""
+"""Statuses with which a server may answer any call at its limit."""
 UNCERTAIN = ("ALREADY_EXISTS", "NOT_FOUND")
-"""What a call may find after one whose end is unknown, because its deadline passed."""
+"""Statuses that a call may get after one whose end is unknown, because its deadline passed."""
 
 
 @dataclass
@@ -73,12 +73,12 @@ WORK: Mapping[str, str] = {
     "comers": "opens a connection each time, one in three closed in the middle of a call",
     "wrong": "sends requests that are to be refused",
 }
-"""What each worker does, by the name that its calls are counted under."""
+"""The work of each worker, by the name that its calls are counted under."""
 
 
 @dataclass(frozen=True)
 class Workers:
-    """What the workers share: times between calls are divided by `pace`; they end once `stopping` is set."""
+    """Data that the workers share: times between calls are divided by `pace`; they end once `stopping` is set."""
 
     address: str
     place: Place

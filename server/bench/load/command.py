@@ -39,7 +39,7 @@ OUTPUT, OUTPUT_FILE = Path("load-output"), "load.json"
 
 @load_app.command("overhead")
 def overhead_command(quick: Quick = False, output: Output = OUTPUT) -> None:
-    """What serving costs without computing, beside a bare grpc.aio server."""
+    """Measures the cost of serving without computing, beside a bare grpc.aio server."""
     _finish(_overhead(quick, output))
 
 

@@ -63,7 +63,7 @@ class PipelineOptions:
 
 @dataclass(frozen=True, eq=False)
 class PipelineResult:
-    """What was measured: sequential calls, 2, 4 and more concurrent ones, and the options' shares of saturation.
+    """Result: sequential calls, 2, 4 and more concurrent ones, and the options' shares of saturation.
 
     Saturation is the largest rate of answers of the ramp. `regular` is the comfortable share of it from clients that
     call at equal intervals, as robots do. At the end all callers hammer.

@@ -16,7 +16,7 @@ import numpy as np
 from mapless.geometry import Array
 
 CONFIDENCE = 0.99
-"""Of each interval: several slopes are asked at once, and all of six hold together in 94 % of cases at least."""
+"""Confidence of each interval; all of six that are asked at once hold together in 94 % of cases at least."""
 MIN_BLOCKS = 6
 """With fewer, medians that ascend by chance would be a slope more often than `CONFIDENCE` says: 2 in 5! of cases."""
 MIN_SAMPLES = 12

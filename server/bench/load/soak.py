@@ -36,9 +36,9 @@ UNITS: Mapping[str, str] = {
     "waiting_jobs": "",
     "loop_lag_ms": "ms",
 }
-"""Of what slopes are taken of."""
+"""Units of the figures whose slopes are taken, by name."""
 BOUND = ("resident_mib", "unique_mib", "python_blocks", "threads", "descriptors", "sockets")
-"""What must not grow. The others are reported: the data folder grows by what is kept of deleted scenes."""
+"""Figures that must not grow. The others are reported: the data folder grows by what is kept of deleted scenes."""
 MIN_SETTLED_S = 300.0
 """In less, what takes minutes, as allocators and caches do, looks like growth."""
 
@@ -83,7 +83,7 @@ class SoakOptions:
 
 @dataclass(frozen=True, eq=False)
 class SoakResult:
-    """What was measured: steps before the soak, its own step, and the server meanwhile.
+    """Result: steps before the soak, its own step, and the server meanwhile.
 
     Slopes are those of the states after the settling, by field; empty if there are too few. The account compares the
     client's and the server's counts; None if the server serves no metrics.

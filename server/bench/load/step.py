@@ -14,7 +14,7 @@ from .watch import SAMPLE_EVERY_S, ProcessSample, Scrape, ServerUnderLoad, proce
 
 Send = Callable[[], Awaitable[list[CallRecord]]]
 CLOSED_SETTLE_SHARE = 0.2
-"""Of a step of calls side by side, what rates leave out: at first as many answers are missing as calls have begun."""
+"""Share of a step that rates leave out: at first as many answers are missing as calls have begun."""
 TREND_CONFIDENCE = 0.95
 TREND_FIELDS = ("resident_mib", "threads", "descriptors")
 

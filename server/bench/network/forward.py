@@ -117,7 +117,7 @@ def max_difference(output: NetworkOutput, reference: NetworkOutput) -> float:
 
 
 def reason_of(error: Exception) -> str:
-    """What failed, in one line for the table."""
+    """The error in one line for the table."""
     return f"{type(error).__name__}: {error}".splitlines()[0][:160].replace("|", "/")
 
 

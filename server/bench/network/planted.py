@@ -18,7 +18,7 @@ from mapless_server.method.features.views import PosedView, ReconstructedView, R
 from mapless_server.method.rejection import Rejection
 
 UNITS_PER_METRE = 0.3
-"""Of the planted reconstruction, so that there is a scale to find."""
+"""Unit of the planted reconstruction, so that there is a scale to find."""
 
 
 @dataclass(frozen=True, eq=False)

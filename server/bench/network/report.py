@@ -32,7 +32,7 @@ class Figure:
 
 HEADINGS = ("figure", "measured", "again", "floor, ms", "x floor", "target", "met")
 COLUMNS = 120
-"""Of the table for people."""
+"""Width of the table on a terminal, in characters."""
 
 
 def markdown(title: str, figures: Sequence[Figure]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Which references a query uses: those that it names, or those that resemble the photograph and match it most.
+"""Chooses the references of a query: those that it names, or those that resemble the photograph and match it most.
 
 Also how the photograph is rolled against them, and whether references elsewhere contradict its pose.
 """

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # services need not load what computes
 
 MAX_RIG_IMAGES = 8
 MIN_FRAMES, MAX_FRAMES = 2, 16
-"""Of a sequence."""
+"""Numbers of frames of a sequence."""
 
 
 def after_rejection(queries: Sequence[Query], outcome: Rejection) -> list[Query] | None:

@@ -31,14 +31,10 @@ from mapless_server.scenes import Choice, RankedReference
 from .query import Tier
 
 MAX_PIXELS = 384 * 288
-"""Of the reduced photograph: features take a third of the time of 640x480, matching and adjusting them half. Medians of
-position errors grow from 0.14 to 0.16 cm in the kitchen, from 0.44 to 0.46 in the office, from 0.04 to 0.14 in
-`euroc-v101-drone` and from 0.48 to 0.94 on the drive, and the radii with them."""
+"""Size of the reduced photograph, for less processor time. Measured: docs/decisions/constants.md."""
 
 REFERENCES = 8
-"""Largest number of references near the prior. With ten the time is an eighth longer, and errors are as large: 0.143 cm
-instead of 0.141 in the kitchen, 0.115 instead of 0.113 in `euroc-v101-drone`, 0.88 instead of 0.78 on the drive. With
-six they are 0.150, 0.129 and 0.76."""
+"""Largest number of references near the prior. Measured: docs/decisions/constants.md."""
 
 OTHERS = 2
 """References elsewhere that are compared."""
@@ -71,7 +67,7 @@ def doubts_of_tracked(found: Hypothesis, options: DoubtOptions) -> Doubt:
 
 
 def elsewhere(near: Choice, alike: Choice) -> list[RankedReference]:
-    """Of the references that resemble the photograph, the first that are further away than all those near the prior."""
+    """The first of the references that resemble the photograph and are further away than all those near the prior."""
     centres = np.stack([it.world_from_camera.translation for it in near.references])
     extent_m = float(np.linalg.norm(centres - centres[0], axis=1).max())
     far = [it for it in alike.references if math.dist(it.world_from_camera.translation, centres[0]) > extent_m]

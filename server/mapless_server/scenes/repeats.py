@@ -29,7 +29,7 @@ class PosedImage:
 
     @staticmethod
     def of(reference_id: str, image: bytes, world_from_camera: RigidTransform) -> "PosedImage":
-        """That of a reference to be added."""
+        """Describes a reference to be added."""
         return PosedImage(reference_id, hashlib.sha256(image).hexdigest(), world_from_camera)
 
 

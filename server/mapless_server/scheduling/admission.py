@@ -43,9 +43,9 @@ class WorkQueueOptions:
 
 
 CLIENT_SHARE = 0.75
-"""That one client may book of what its caller may book beside its other clients, so that there is room for the next."""
+"""Share that one client may book of its caller's room, so that there is room for other clients."""
 MEMORY_SHARE = CLIENT_SHARE**0.5
-"""That one caller may hold of the memory that others leave, and a client of its caller's part."""
+"""Share that one caller may hold of the memory that others leave, and a client of its caller's part."""
 TIME_MARGIN = 1.2
 """A job is admitted if at least so many times its predicted time remains until its deadline. Predictions are averages,
 and a result that comes too late is wasted for everyone."""

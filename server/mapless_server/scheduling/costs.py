@@ -158,5 +158,5 @@ class FirstSteps:
             self._steps.popitem(last=False)
 
     def last(self, flow: Flow, step: AnyStep) -> AnyStep:
-        """That of the caller's last job in the stage of a step; this step if there was none."""
+        """The step of the caller's last job in the stage of a step; this step if there was none."""
         return self._steps.get((flow.group, step.stage), step)

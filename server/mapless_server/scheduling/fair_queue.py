@@ -42,7 +42,7 @@ class FairQueue(Generic[J]):
         return self._cost_s if self._flow_of else 0.0  # without rounding errors
 
     def turn(self, is_allowed: Callable[[J], bool]) -> Turn | None:
-        """That of the client whose job is computed next, of the allowed jobs; None if none waits."""
+        """The turn of the client whose job is computed next, of the allowed jobs; None if none waits."""
         flows = (flow for flow, jobs in self._jobs.items() if any(map(is_allowed, jobs)))
         return min(map(self._shares.turn, flows), default=None)
 

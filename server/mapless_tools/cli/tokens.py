@@ -15,7 +15,7 @@ from .printing import AsJson, printed_as_json
 token_app = typer.Typer(help="Tokens that callers must have: create, list and revoke them.", no_args_is_help=True)
 
 DEFAULT_TENANT = "default"
-"""That of `mapless_server.security`, whose import takes too long for --help; a test compares."""
+"""The default of `mapless_server.security`, whose import takes too long for --help; a test compares."""
 TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; default: the server's setting.")]
 
 

@@ -29,7 +29,7 @@ TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 class Expected(StrEnum):
-    """What an engine should say; any other pose than the true one is wrong in every case."""
+    """The answer that is expected; any other pose than the true one is wrong in every case."""
 
     RIGHT = "right"
     RIGHT_OR_REJECTED = "right or rejected"

@@ -1,4 +1,4 @@
-"""What stands in the room, 5 x 4 x 2.6 m: placed by hand, painted by chance; and the light on it.
+"""Furniture of the room, 5 x 4 x 2.6 m: placed by hand, painted by chance; and the light on it.
 
 World axes: x along the long walls, y across, z up, metres; the origin is a corner of the floor. The window is in the
 wall x = 0, the bookshelf stands at x = 5, the door is in the wall y = 0, the cupboard stands at y = 4.
