@@ -25,7 +25,7 @@ from mapless import (
     SequenceFrame,
 )
 from mapless.geometry import rotation_angle_deg
-from mapless_server.services.capture.files import calls_of
+from mapless_server.services.capture.folder import calls_of
 from mapless_tools.child import child_server
 
 ANGLES = (0.0, 0.8)
@@ -166,6 +166,6 @@ def test_the_command_prints_it_and_fails_all_the_same(
 def test_a_replay_gives_it_again(asked: tuple[Client, str, Path]) -> None:
     client, _, folder = asked
     the_pose(client.localize(PHOTO, corner.CAMERA, "corner", mask=MASK, include_imprecise_pose=True))
-    wait_until(lambda: len(list(calls_of(folder / "calls"))) >= 1)
-    done = run("replay", folder / "calls", "--last", "3", "--json")
+    wait_until(lambda: len(calls_of(folder / "calls")) >= 1)
+    done = run("replay", folder / "calls", "--data-dir", folder / "data", "--last", "3", "--json")
     assert {it["verdict"] for it in json.loads(done.stdout)["calls"]} == {"identical"}

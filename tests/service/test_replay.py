@@ -1,17 +1,17 @@
-"""Captured calls can be computed again exactly: answers of a real server, replayed by another process.
+"""Captured calls can be computed again exactly: answers of a real server, from its store or a backup.
 
 The law: with the same program and settings every replayed answer is the answer, to the last bit; whatever was planted
-into the folder is found, and named.
+into the folder or the store is found, and named.
 """
 
-import hashlib
 import json
-import os
 import shutil
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +20,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from support import corner
+from support.captures import NOW_S, a_call, filled, opened
+from support.commands import run
 from support.images import encode, textured
+from support.stores import make_reference
 from support.waiting import wait_until
 
 from mapless import (
@@ -46,14 +49,15 @@ from mapless_server.scenes import Selection as Wanted
 from mapless_server.scheduling import Next, Step
 from mapless_server.security import key_of
 from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CaptureError, decode_call, encode_call
-from mapless_server.services.capture.files import blob_path, calls_of
-from mapless_server.settings import load_settings
+from mapless_server.services.capture.folder import calls_of
+from mapless_server.store import Store
+from mapless_server.store.backup import back_up
+from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_tools.child import child_server
-from mapless_tools.replay import report as report_module
-from mapless_tools.replay.recompute import RecordedSource, followed, recompute
-from mapless_tools.replay.report import Report, Selection, select
+from mapless_tools.replay.recompute import RecordedSource, followed
+from mapless_tools.replay.report import Selection, select
 
-pytestmark = pytest.mark.nightly("replay")
+NIGHTLY = pytest.mark.nightly("replay")
 
 ANGLES = range(-24, 25, 8)
 QUERIES = [corner.pose(angle, height) for angle, height in ((3.3, -1.5), (-14.0, -1.7), (20.0, -1.55))]
@@ -106,7 +110,7 @@ def calls(client: Client) -> list[Callable[[], Any]]:
 
 def test_each_kind_of_features_gets_its_own_choice() -> None:
     upright, rolled = Choice((), "vlad-1-edgepoint2", 1), Choice((), "vlad-1-sift", 1)
-    part = CapturedPart("image", 1, (), (rolled, upright))
+    part = CapturedPart("image", 1, {}, (rolled, upright))
     source = RecordedSource(cast(Any, None), part, cast(Any, None), cast(Any, None), False, "sift")
     for name, expected in (("edgepoint2", upright), ("aliked", upright), ("sift", rolled)):
         extractor = cast(Any, SimpleNamespace(name=name))
@@ -115,12 +119,11 @@ def test_each_kind_of_features_gets_its_own_choice() -> None:
 
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a call of each kind, by itself, and some of them once more, side by side."""
+    """A folder with calls of each kind, alone and side by side; their store, a backup, and a replay while served."""
     folder = tmp_path_factory.mktemp("captured")
     flags = {"--capture-dir": str(folder / "calls"), "--workers": "2"}
-    environment = {"MAPLESS_CAPTURE_HOURS": "1"}
     with (
-        child_server(folder / "data", flags, environment) as server,
+        child_server(folder / "data", flags, {"MAPLESS_CAPTURE_HOURS": "1"}) as server,
         Client(server.address) as client,
         ThreadPoolExecutor(4) as pool,
     ):
@@ -136,41 +139,47 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
         list(pool.map(lambda call: call(), calls(client)[::5]))
         with pytest.raises(NotFound):  # of which nothing is kept
             client.localize(PHOTOS[0], corner.CAMERA, "nowhere")
-        wait_until(lambda: len(list(calls_of(folder / "calls"))) == CAPTURED)
-    return folder / "calls"
+        wait_until(lambda: len(calls_of(folder / "calls")) == CAPTURED)
+        while_served = run("replay", folder / "calls", "--data-dir", folder / "data", "--last", "2")
+        (folder / "while served").write_text(while_served.output)
+    database = SqliteDatabase.open_as_is(folder / "data" / DATABASE_FILE)
+    back_up(database, folder / "backup")
+    database.close()
+    return folder
 
 
-def replay(folder: Path, *arguments: str, **environment: str) -> tuple[int, dict[str, Any]]:
-    """Exit code and report of the command, which runs on its own, far from the store."""
-    command = [sys.executable, "-m", "mapless_tools", "replay", str(folder), "--json", *arguments]
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=100, cwd=folder.parent, env={**os.environ, **environment}
-    )
-    assert not done.stderr
-    return done.returncode, json.loads(done.stdout)
+@NIGHTLY
+def test_answers_are_computed_again_while_the_store_is_served(captured: Path) -> None:
+    assert (captured / "while served").read_text().endswith("2 identical\n")
 
 
+@NIGHTLY
 def test_every_answer_is_computed_again_to_the_last_bit(captured: Path, tmp_path: Path) -> None:
-    """Retrieved and named references, priors, every kind of rejection, rigs, walks, alone and side by side."""
-    copy = shutil.copytree(captured, tmp_path / "elsewhere")
-    code, report = replay(copy)
-    different = [call for call in report["calls"] if call["verdict"] == "changed"]
-    assert not different
-    assert [call["verdict"] for call in report["calls"]].count("identical") == CAPTURED
+    """From a backup, elsewhere: retrieved and named references, priors, every rejection, rigs, walks, side by side."""
+    shutil.copytree(captured / "calls", tmp_path / "calls")
+    shutil.copy(captured / "backup", tmp_path / "backup")
+    command = [sys.executable, "-m", "mapless_tools", "replay", "calls", "--backup", "backup", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=170, cwd=tmp_path)
+    assert not done.stderr
+    report = json.loads(done.stdout)
+    assert [call for call in report["calls"] if call["verdict"] != "identical"] == []
+    assert len(report["calls"]) == CAPTURED
     outcomes = {call["outcome_now"] for call in report["calls"]}
     assert {"localized", "low_texture", "prior_conflict", "no_usable_references"} <= outcomes
     assert {call["method"] for call in report["calls"]} == {"Localize", "LocalizeRig", "LocalizeSequence"}
     assert report["circumstances"] == report["unreadable"] == []
-    assert code == 0
+    assert done.returncode == 0
+    assert (tmp_path / "backup").read_bytes() == (captured / "backup").read_bytes()
 
 
-def only(captured: Path, folder: Path, wanted: Callable[[CapturedCall], bool]) -> tuple[Path, CapturedCall]:
-    """A copy of the folder with one call in it, which fits."""
-    copy = shutil.copytree(captured, folder)
+def only(captured: Path, folder: Path, is_wanted: Callable[[CapturedCall], bool]) -> tuple[Path, CapturedCall]:
+    """A copy of the folder with one call in it, which fits, and of the store."""
+    shutil.copytree(captured / "calls", folder / "calls")
+    shutil.copytree(captured / "data", folder / "data")
     found = None
-    for path in sorted(calls_of(copy)):
+    for path in calls_of(folder / "calls"):
         call = decode_call(path.read_bytes())
-        if found is None and wanted(call):
+        if found is None and is_wanted(call):
             found = path, call
         else:
             path.unlink()
@@ -182,131 +191,119 @@ def is_named(call: CapturedCall) -> bool:
     return [part.choices for part in call.parts] == [()] and len(call.parts[0].references) == len(NAMED)
 
 
-def test_a_moved_reference_is_detected(captured: Path, tmp_path: Path) -> None:
-    path, call = only(captured, tmp_path / "copy", is_named)
-    (part,) = call.parts
-    first = part.references[0]
-    moved = Pose(first.world_from_camera.rotation, first.world_from_camera.translation + [0.002, 0, 0])
-    planted = replace(part, references=(replace(first, world_from_camera=moved), *part.references[1:]))
-    path.write_bytes(encode_call(replace(call, parts=(planted,))))
-    code, report = replay(tmp_path / "copy")
+def replay(folder: Path, *arguments: str) -> tuple[int, dict[str, Any]]:
+    """Exit code and report of the command, on the store beside the calls."""
+    done = run("replay", folder / "calls", "--data-dir", folder / "data", "--json", *arguments)
+    return done.exit_code, json.loads(done.stdout)
+
+
+@NIGHTLY
+def test_an_answer_that_was_another_is_shown(captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By fields, distance and outcome, with what is computed by: another version then, another coverage now."""
+    path, call = only(captured, tmp_path, is_named)
+    then = pb.LocalizeResponse.FromString(call.response)
+    then.localization.world_from_camera.translation.x += 0.002
+    planted = replace(call, response=then.SerializeToString(), circumstances=call.circumstances | {"mapless": "0.0.1"})
+    path.write_bytes(encode_call(planted))
+    code, report = replay(tmp_path)
     (replayed,) = report["calls"]
-    assert code == 1
-    assert replayed["verdict"] == "changed"
-    assert 1e-4 < replayed["apart_cm"] < 1
-    assert replayed["apart_deg"] < 0.2
-    assert any(it["field"].startswith("localization.world_from_camera") for it in replayed["changes"])
-
-
-def test_what_is_computed_with_is_compared_too(captured: Path, tmp_path: Path) -> None:
-    """Another version then, and another coverage now, under which the pose is not trusted."""
-    path, call = only(captured, tmp_path / "copy", is_named)
-    path.write_bytes(encode_call(replace(call, circumstances={**call.circumstances, "mapless": "0.0.1"})))
-    code, report = replay(tmp_path / "copy", MAPLESS_COVERAGE="0.000001")
-    changed = {it["field"]: (it["then"], it["now"]) for it in report["circumstances"]}
-    assert changed["mapless"][0] == "0.0.1"
-    assert changed["coverage"] == ("0.95", "1e-06")
+    assert (code, replayed["verdict"]) == (1, "changed")
+    assert replayed["apart_cm"] == pytest.approx(0.2)
+    assert replayed["apart_deg"] == 0
+    assert [it["field"] for it in replayed["changes"]] == ["localization.world_from_camera.translation.x"]
+    text = run("replay", tmp_path / "calls", "--data-dir", tmp_path / "data").output
+    assert "mapless: then 0.0.1, now " in text
+    assert f"{call.request_id} Localize default/corner: changed, localized" in text
+    assert "the poses are 0.2000 cm and 0.00000 degrees apart" in text
+    assert text.endswith("1 changed\n")
+    monkeypatch.setenv("MAPLESS_COVERAGE", "0.000001")
+    code, report = replay(tmp_path)
+    assert {"field": "coverage", "then": "0.95", "now": "1e-06"} in report["circumstances"]
     (replayed,) = report["calls"]
-    assert (replayed["outcome_then"], replayed["outcome_now"]) == ("localized", "gate")
-    assert code == 1
+    assert (code, replayed["outcome_then"], replayed["outcome_now"]) == (1, "localized", "gate")
 
 
-def test_the_table_shows_what_has_changed(captured: Path, tmp_path: Path) -> None:
-    path, call = only(captured, tmp_path / "copy", is_named)
-    path.write_bytes(encode_call(replace(call, circumstances={**call.circumstances, "mapless": "0.0.1"})))
-    command = [sys.executable, "-m", "mapless_tools", "replay", str(tmp_path / "copy"), "--last", "1"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
-    assert "mapless: then 0.0.1, now " in done.stdout
-    assert f"{call.request_id} Localize default/corner: identical, localized" in done.stdout
-    assert done.stdout.endswith("1 identical\n")
+@NIGHTLY
+def test_references_that_have_changed_since_are_named(captured: Path, tmp_path: Path) -> None:
+    """Others of the scene may change; and a scene that was deleted, or is in another store, is named, too."""
+    _, call = only(captured, tmp_path, is_named)
+    scene_key = key_of("default", "corner")
+    with Store.open(tmp_path / "data") as store:
+        store.delete_reference(scene_key, "r0")
+    assert replay(tmp_path)[0] == 0
+    with Store.open(tmp_path / "data") as store:
+        store.delete_reference(scene_key, "r3")
+        store.delete_reference(scene_key, "r5")
+        store.add_references(scene_key, [make_reference("r3")])
+    code, report = replay(tmp_path)
+    assert (code, report["calls"][0]["verdict"]) == (1, "not computed")
+    changed = "error: references of scene 'corner' have changed since: 'r3' was replaced, 'r5' was deleted"
+    assert report["calls"][0]["error"] == changed
+    with Store.open(tmp_path / "data") as store:
+        store.delete_scene(scene_key)
+    text = run("replay", tmp_path / "calls", "--data-dir", tmp_path / "data").output
+    assert (
+        f"{call.request_id} Localize default/corner: not computed, localized then; now error: scene 'corner' " in text
+    )
+    assert "was deleted since, or is in another store" in text
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "blob"])
-def test_damage_is_named_and_not_counted_as_identical(captured: Path, tmp_path: Path, damage: str) -> None:
-    path, call = only(captured, tmp_path / "copy", is_named)
-    data = bytearray(path.read_bytes())
-    if damage == "cut":
-        path.write_bytes(data[:-1])
-    elif damage == "flipped":
-        data[-100] ^= 1
-        path.write_bytes(data)
-    else:
-        view = next(iter(call.parts[0].references[0].views.values()))
-        (tmp_path / "copy" / "tenants" / "default" / "blobs" / view).unlink()
-    code, report = replay(tmp_path / "copy")
-    assert code == 1
-    assert "identical" not in {it["verdict"] for it in report["calls"]}
-    errors = [*report["unreadable"], *(it["error"] for it in report["calls"])]
-    assert len(errors) == 1
-    assert "No such file" in errors[0] if damage == "blob" else "cut" in errors[0]
+@NIGHTLY
+def test_features_that_the_store_lacks_are_found_anew(captured: Path, tmp_path: Path) -> None:
+    """And kept in memory alone; so are those of another version, which are alike, and then the answer is."""
+    only(captured, tmp_path, is_named)
+    path = tmp_path / "data" / DATABASE_FILE
+    with closing(sqlite3.connect(path)) as connection, connection:
+        assert connection.execute("DELETE FROM features").rowcount
+    before = path.read_bytes()
+    code, report = replay(tmp_path)
+    assert (code, report["calls"][0]["verdict"]) == (0, "identical")
+    assert path.read_bytes() == before
 
 
-def test_features_of_an_unknown_form_are_extracted_anew(captured: Path, tmp_path: Path) -> None:
-    """Of another version, whose features are alike; so the answer is, too."""
-    path, call = only(captured, tmp_path / "copy", is_named)
-    (part,) = call.parts
-    first = part.references[0]
-    (extractor,) = first.views
-    data = b"of another version"
-    name = hashlib.sha256(data).hexdigest()
-    blob_path(tmp_path / "copy", call.tenant, name).write_bytes(data)
-    planted = replace(part, references=(replace(first, views={extractor: name}), *part.references[1:]))
-    path.write_bytes(encode_call(replace(call, parts=(planted,))))
-    code, report = replay(tmp_path / "copy")
-    (replayed,) = report["calls"]
-    assert (code, replayed["verdict"], replayed["found_anew"]) == (0, "identical", 1)
-
-
+@NIGHTLY
 def test_a_call_that_cannot_be_computed_is_one_row(captured: Path, tmp_path: Path) -> None:
-    """A method of another version, and a request that is no message; a third one is as it was."""
-    path, call = only(captured, tmp_path / "copy", is_named)
+    """A method of another version, a request that is no message, and a damaged file; a fourth one is as it was."""
+    path, call = only(captured, tmp_path, is_named)
     for name, planted in {
-        "1-1-1": replace(call, method="LocalizeTwice", request_id="unknown"),
-        "1-1-2": replace(call, request=b"\xff\xff", request_id="garbage"),
+        "1-1": replace(call, method="LocalizeTwice", request_id="unknown"),
+        "1-2": replace(call, request=b"\xff\xff", request_id="garbage"),
     }.items():
         path.with_name(f"{name}.call").write_bytes(encode_call(planted))
-    code, report = replay(tmp_path / "copy")
+    path.with_name("1-3.call").write_bytes(encode_call(call)[:-1])
+    code, report = replay(tmp_path)
     verdicts = {it["request_id"]: (it["verdict"], it["error"]) for it in report["calls"]}
     assert code == 1
     assert verdicts["unknown"] == ("not computed", "error: this program knows no method LocalizeTwice")
     assert verdicts["garbage"][0] == "not computed"
     assert verdicts["garbage"][1].startswith("error: DecodeError: ")
     assert verdicts[call.request_id] == ("identical", "")
+    assert report["unreadable"] == ["tenants/default/calls/corner/1-3.call: it is cut or damaged, or no captured call"]
 
 
-def test_only_what_was_asked_for_is_judged(captured: Path, tmp_path: Path) -> None:
+def test_only_what_was_asked_for_is_judged(tmp_path: Path) -> None:
     """Another tenant's unreadable file is not reported; an id that does not exist is."""
-    _, call = only(captured, tmp_path / "copy", is_named)
-    theirs = tmp_path / "copy" / "tenants" / "other" / "calls" / "z" / "00000000000001-1-1.call"
+    folder = opened(tmp_path)
+    for number in range(3):
+        folder.add(a_call(number, NOW_S + number))
+    folder.close()
+    first, second, third = calls_of(tmp_path)
+    theirs = tmp_path / "tenants" / "other" / "calls" / "z" / "00000000000001-1.call"
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"junk")
 
-    def report_on(**options: Any) -> Report:
-        return report_module.replay(tmp_path / "copy", Selection(**options), load_settings({}).settings)
+    def selected(**options: Any) -> tuple[list[Path], int]:
+        unreadable: list[str] = []
+        return select(tmp_path, Selection(**options), unreadable), len(unreadable)
 
-    for options in ({"tenant": "default"}, {"request_ids": frozenset({call.request_id})}, {"last": 1}):
-        report = report_on(**options)
-        assert (report.is_identical, len(report.calls), report.unreadable) == (True, 1, ())
-    report = report_on()
-    assert (report.is_identical, len(report.calls), len(report.unreadable)) == (False, 1, 1)
+    assert selected() == ([first, second, third], 1)
+    assert selected(tenant="acme") == selected(scene_id="hall") == ([first, second, third], 0)
+    assert selected(last=2) == ([second, third], 0)
+    assert selected(request_ids=frozenset({"id-0", "id-2"})) == ([first, third], 0)
+    assert selected(request_ids=frozenset({"id-0", "id-2"}), last=1) == ([third], 0)
+    assert selected(tenant="other") == ([], 1)
     with pytest.raises(CaptureError, match="holds no call of id absent; 1 files cannot be read"):
-        select(tmp_path / "copy", Selection(frozenset({"absent"})), [])
-
-
-def test_what_its_server_deletes_meanwhile_is_left_out(
-    captured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The call first, and then its blobs, as a server does."""
-    path, _ = only(captured, tmp_path / "copy", is_named)
-
-    def deleted_meanwhile(*arguments: Any) -> Any:
-        path.unlink()
-        shutil.rmtree(tmp_path / "copy" / "tenants" / "default" / "blobs")
-        return recompute(*arguments)
-
-    monkeypatch.setattr(report_module, "recompute", deleted_meanwhile)
-    report = report_module.replay(tmp_path / "copy", Selection(), load_settings({}).settings)
-    assert (report.calls, report.unreadable, report.is_identical) == ((), (), True)
+        selected(request_ids=frozenset({"absent", "id-1"}))
 
 
 @pytest.mark.parametrize(
@@ -314,16 +311,17 @@ def test_what_its_server_deletes_meanwhile_is_left_out(
     [
         (["--id", "nobody"], "holds no call of id nobody"),
         (["--tenant", "nobody"], "holds no such calls"),
+        (["--data-dir", "absent"], "there is no database absent/mapless.sqlite3; name the store that answered"),
+        (["--backup", "absent"], "there is no database absent; name the store that answered"),
         (["--backend", "pi4"], "pi4"),
         (["--last", "0"], "--last"),
     ],
 )
-def test_a_replay_that_is_not_possible_is_refused(captured: Path, arguments: list[str], message: str) -> None:
-    command = [sys.executable, "-m", "mapless_tools", "replay", str(captured), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_replay_that_is_not_possible_is_refused(tmp_path: Path, arguments: list[str], message: str) -> None:
+    filled(tmp_path)
+    done = run("replay", tmp_path, *arguments)
+    assert done.exit_code == 2
+    assert message in " ".join(done.stderr.split())
 
 
 THEN = [("as it is", "cheap", "gate"), ("lines", "cheap", "gate"), ("stronger", "strong", "unfinished")]
@@ -364,15 +362,3 @@ def test_references_not_matched_then_are_not_matched_again(unmatched: int, expec
     steps = tuple(Step("", "", "", it) for it in payloads)
     tiers: Any = [SimpleNamespace(features="strong")]
     assert followed(then, tiers, Next(steps)) == (steps[expected], True)
-
-
-def test_a_folder_that_is_none_is_refused(tmp_path: Path) -> None:
-    for folder, message in ((tmp_path / "absent", "no capture folder"), (tmp_path, "no capture folder")):
-        command = [sys.executable, "-m", "mapless_tools", "replay", str(folder)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
-        assert (done.returncode, message in done.stderr) == (2, True)
-    (tmp_path / "mapless-capture.json").write_text('{"format": 99}')
-    done = subprocess.run(
-        [sys.executable, "-m", "mapless_tools", "replay", str(tmp_path)], capture_output=True, text=True, timeout=100
-    )
-    assert (done.returncode, "has format 99" in done.stderr) == (2, True)

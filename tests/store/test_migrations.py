@@ -18,8 +18,8 @@ from support.stores import EXTRACTOR, Place, Shared, faults_of, make_reference
 
 from mapless.geometry import Camera
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, StoreError
-from mapless_server.store.backup import back_up, restore
+from mapless_server.store import LruCache, Store, StoreError
+from mapless_server.store.backup import back_up, reading_backup, restore
 from mapless_server.store.tables import SCHEMA_VERSION, metadata
 
 OFFICE, EMPTY = SceneKey("office"), SceneKey("empty")
@@ -96,6 +96,9 @@ def test_backups_of_earlier_releases_are_restored(place: Place, release: str, tm
                 back_up(database, tmp_path / "backup")
             return
         assert back_up(database, tmp_path / "backup").faults == ()
+    with reading_backup(tmp_path / "backup") as current:
+        read = Store(current, LruCache(0)).load_references(OFFICE, ["a"], EXTRACTOR)
+        assert read.references[0].record.camera.width_px == 64
     with Store.open(tmp_path / "other") as store:
         assert restore(tmp_path / "backup", store.database).faults == ()
         assert store.load_references(OFFICE, ["a"], EXTRACTOR).references[0].record.camera.width_px == 64

@@ -61,7 +61,7 @@ COUNTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "capture_dropped": (
         "Calls that were to be captured and were not.",
         "reason",
-        ("queue", "size", "disk", "deleted", "store", "fault"),
+        ("queue", "size", "disk", "fault"),
     ),
 }
 """Counters that other rooms use by name: the counter's text, its label, and the label's values."""

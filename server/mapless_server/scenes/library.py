@@ -113,7 +113,7 @@ class ReferenceLibrary:
         while True:
             snapshot = self._store.load_references(scene_key, reference_ids, extractor.name)
             if not snapshot.undescribed:
-                views = tuple(map(self._posed_view, snapshot.references))
+                views = tuple(map(self.posed_view, snapshot.references))
                 if self._depths is not None:
                     views = self._depths.with_depths(views, extractor.name)
                 return snapshot.generation, views
@@ -177,11 +177,15 @@ class ReferenceLibrary:
     def _describe(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
         # Another thread may have finished between reading the store and taking the lock.
         if not self._store.has_features(record.key, extractor.name):
-            view = extractor.extract(self._pixels(record), record.camera, self._ignored(record))
             with suppress(AlreadyExists):  # another server on the same store was faster
-                self._store.add_features(record.key, extractor.name, view)
+                self._store.add_features(record.key, extractor.name, self.extract(record, extractor))
 
-    def _posed_view(self, reference: DescribedReference) -> PosedView:
+    def extract(self, record: ReferenceRecord, extractor: FeatureExtractor) -> View:
+        """Finds features in the stored photograph; NotFound if the reference was deleted, DataLoss if it is damaged."""
+        return extractor.extract(self._pixels(record), record.camera, self._ignored(record))
+
+    def posed_view(self, reference: DescribedReference) -> PosedView:
+        """A stored reference as the pipeline needs it; its photograph is read when its pixels are first used."""
         record, view = reference.record, reference.view
         read = partial(self._pixels, record), partial(self._ignored, record)
         photograph = Photograph(lambda: record.image_sha256, record.camera, *read)

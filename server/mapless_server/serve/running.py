@@ -222,7 +222,7 @@ async def _start(
     if tracer is not None:
         stack.push_async_callback(asyncio.to_thread, tracer.close, _TRACES_FLUSH_S)
     metrics_address = _serve_metrics(settings, metrics, store, protection, stack)
-    recorder = await asyncio.to_thread(open_recorder, settings, store, metrics)
+    recorder = await asyncio.to_thread(open_recorder, settings, metrics)
     if recorder is not None:
         stack.push_async_callback(asyncio.to_thread, recorder.close)
     authenticate = protection.authenticator.authenticate

@@ -100,6 +100,17 @@ def restore(path: Path, database: Database, on_progress: Progress = ignore_progr
     return written
 
 
+@contextmanager
+def reading_backup(path: Path) -> Iterator[Database]:
+    """A backup, in this program's schema, until the end of the block; StoreError if it cannot be read."""
+    with closing(SqliteDatabase.open_as_is(path)) as backup:
+        with backup.read() as connection:
+            version = read_version(connection)
+        assert version is not None
+        with _in_current_schema(backup, path, version) as current:
+            yield current
+
+
 def _copy_pages(source: Connection, path: Path, on_progress: Progress) -> None:
     """Copies with SQLite's backup API; `source` has begun to read, so the copy has no later changes."""
     raw = source.connection.driver_connection

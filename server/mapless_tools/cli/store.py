@@ -95,14 +95,15 @@ def _open(config: Path | None, data_dir: Path | None, as_is: bool = False) -> Da
     """The settings' store: migrated to this program's schema, and created if missing; or read while others use it."""
     from mapless_server.settings import load_settings
     from mapless_server.store.postgresql import PostgresqlDatabase
-    from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+    from mapless_server.store.sqlite import SqliteDatabase
+    from mapless_tools.stores import open_database_as_is
 
     settings = load_settings({"data_dir": data_dir}, config).settings
+    if as_is:
+        return open_database_as_is(settings)
     if settings.database_url:
-        url = settings.database_url.get_secret_value()
-        return PostgresqlDatabase.open_as_is(url) if as_is else PostgresqlDatabase.open(url)
-    folder = settings.data_dir
-    return SqliteDatabase.open_as_is(folder / DATABASE_FILE) if as_is else SqliteDatabase.open(folder)
+        return PostgresqlDatabase.open(settings.database_url.get_secret_value())
+    return SqliteDatabase.open(settings.data_dir)
 
 
 @contextmanager

@@ -26,6 +26,10 @@ def replay_command(
     tenant: Annotated[str, typer.Option(help="Only this tenant's.")] = "",
     scene: Annotated[str, typer.Option(help="Only those in the scene of this id.")] = "",
     json_output: Annotated[bool, typer.Option("--json", help="Everything, as JSON.")] = False,
+    backup: Annotated[
+        Path | None, typer.Option(help="A backup of the store, to read references from; default: the settings' store.")
+    ] = None,
+    data_dir: Annotated[Path | None, typer.Option(help="Folder of the store; default: the server's setting.")] = None,
     config: Annotated[Path | None, typer.Option(help="TOML file of settings; also MAPLESS_CONFIG.")] = None,
     backend: Annotated[str | None, typer.Option(help="As the server's setting.")] = None,
     features: Annotated[str | None, typer.Option(help="As the server's setting.")] = None,
@@ -34,13 +38,20 @@ def replay_command(
 ) -> None:
     """Compute captured answers again, by this program and its settings; exit code 1 unless all are identical.
 
-    Identical is to the last bit. References are those that were captured, and so is the choice among them; no store is
-    read.
+    Identical is to the last bit. References are read from the store that answered, which may be served meanwhile, or a
+    backup of it. The choice among them is that of the captured answer; a call whose references have changed since is
+    not computed, and names them.
     """
     from mapless_server.serve.libraries import configure_libraries
     from mapless_server.settings import ConfigError, load_settings
 
-    flags = {"backend": backend, "features": features, "device": device, "weights_dir": weights_dir}
+    flags = {
+        "data_dir": data_dir,
+        "backend": backend,
+        "features": features,
+        "device": device,
+        "weights_dir": weights_dir,
+    }
     try:
         settings = load_settings(flags, config).settings
     except ConfigError as error:
@@ -53,7 +64,7 @@ def replay_command(
 
     try:
         selection = Selection(frozenset(request_id or ()), last, tenant, scene)
-        report = replay(folder, selection, settings)
+        report = replay(folder, selection, settings, backup)
     except CaptureError as error:
         fail(str(error))
     if json_output:
@@ -86,8 +97,6 @@ def _print_call(call: Replayed) -> None:
         print(f"{head}: {call.verdict}, {call.outcome_then} then; now {call.error}")
         return
     print(f"{head}: {call.verdict}, {call.outcome_now}, {call.seconds_then:.2f} s then, {call.seconds_now:.2f} s now")
-    if call.found_anew:
-        print(f"    this version cannot read the features of {call.found_anew} references, and extracted them again")
     if call.verdict == "identical":
         return
     if call.apart_cm is not None and call.apart_deg is not None:

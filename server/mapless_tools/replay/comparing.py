@@ -9,8 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from google.protobuf.descriptor import FieldDescriptor
-from google.protobuf.message import Message
+from google.protobuf.json_format import MessageToDict
 
 from mapless import wire
 from mapless.geometry import rotation_angle_deg
@@ -20,6 +19,10 @@ from mapless_server.services.capture.calls import Response, diagnostics_of
 
 DESCRIBE = "describe"
 """The stage in which a server extracts the features that a replay already has."""
+NO_ANSWER = ("request_id", "server_version", "captured", "attempts") + tuple(
+    f"{name}_duration" for name in ("queue", "total", "processor")
+)
+"""Fields of diagnostics that are no part of the answer."""
 ABSENT = "-"
 
 MAX_CHANGES = 40
@@ -50,15 +53,12 @@ def compare(then: Response, now: Response) -> Comparison:
     first, second = _essence(then), _essence(now)
     if first.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True):
         return Comparison(True)
-    was, is_now = dict(_leaves(first)), dict(_leaves(second))
-    different = [it for it in was | is_now if was.get(it, ABSENT) != is_now.get(it, ABSENT)]
-    changes = [Change(it, was.get(it, ABSENT), is_now.get(it, ABSENT)) for it in different]
-    apart_cm, apart_deg = _apart(_pose_of(first), _pose_of(second))
-    return Comparison(False, tuple(changes[:MAX_CHANGES]), apart_cm, apart_deg)
+    was, is_now = (dict(_leaves(MessageToDict(it, preserving_proto_field_name=True))) for it in (first, second))
+    return Comparison(False, tuple(changed(was, is_now)[:MAX_CHANGES]), *_apart(first, second))
 
 
 def changed(then: Mapping[str, str], now: Mapping[str, str]) -> list[Change]:
-    """Differences of versions, settings and weights."""
+    """Differences of values by name."""
     names = [it for it in {**then, **now} if then.get(it, ABSENT) != now.get(it, ABSENT)]
     return [Change(it, then.get(it, ABSENT), now.get(it, ABSENT)) for it in names]
 
@@ -76,8 +76,7 @@ def outcome_of(response: Any) -> str:
     """The outcome in a word: "localized", or the reason of the rejection."""
     if response.HasField("localization"):
         return "localized"
-    known = response.rejection.DESCRIPTOR.fields_by_name["reason"].enum_type.values_by_number
-    return str(known[response.rejection.reason].name).removeprefix("REJECTION_REASON_").lower()
+    return pb.RejectionReason.Name(response.rejection.reason).removeprefix("REJECTION_REASON_").lower()
 
 
 def _essence(response: Any) -> Any:
@@ -85,15 +84,7 @@ def _essence(response: Any) -> Any:
     copy = type(response)()
     copy.CopyFrom(response)
     for diagnostics in diagnostics_of(copy):
-        for name in (
-            "request_id",
-            "queue_duration",
-            "total_duration",
-            "processor_duration",
-            "attempts",
-            "server_version",
-            "captured",
-        ):
+        for name in NO_ANSWER:
             diagnostics.ClearField(name)
         kept = [it.stage for it in diagnostics.stages if it.stage != DESCRIBE]
         del diagnostics.stages[:]
@@ -101,45 +92,29 @@ def _essence(response: Any) -> Any:
     return copy
 
 
-def _leaves(message: Message, path: str = "") -> Iterator[tuple[str, str]]:
-    """Every value of a message, by its path, as text that two values share only if they are equal."""
-    for field, value in message.ListFields():
-        name = f"{path}.{field.name}" if path else field.name
-        if not field.is_repeated:
-            yield from _leaf(field, name, value)
-            continue
-        for index, item in enumerate(value):
-            yield from _leaf(field, f"{name}[{index}]", item)
-
-
-def _leaf(field: FieldDescriptor, name: str, value: Any) -> Iterator[tuple[str, str]]:
-    if field.message_type is not None:
-        yield name, "{}"
-        yield from _leaves(value, name)
-    elif field.enum_type is not None:
-        known = field.enum_type.values_by_number.get(value)
-        yield name, known.name if known else str(value)
+def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Every value of a message as a dictionary, by its path, as text that two values share only if they are equal."""
+    if isinstance(value, dict):
+        yield path, "{}"
+        for name, inner in value.items():
+            yield from _leaves(inner, f"{path}.{name}" if path else name)
+    elif isinstance(value, list):
+        for index, inner in enumerate(value):
+            yield from _leaves(inner, f"{path}[{index}]")
     else:
-        yield name, repr(value) if not isinstance(value, str) else value
+        yield path, value if isinstance(value, str) else repr(value)
 
 
-def _pose_of(response: Any) -> geometry_pb.RigidTransform | None:
-    if not response.HasField("localization"):
-        return None
-    if isinstance(response, pb.LocalizeResponse):
-        found = response.localization.world_from_camera
-    elif isinstance(response, pb.LocalizeRigResponse):
-        found = response.localization.world_from_rig
-    else:
-        found = response.localization.poses[-1].world_from_camera
-    return found
-
-
-def _apart(
-    first: geometry_pb.RigidTransform | None, second: geometry_pb.RigidTransform | None
-) -> tuple[float | None, float | None]:
-    if first is None or second is None:
+def _apart(first: Any, second: Any) -> tuple[float | None, float | None]:
+    """Distance of two answers' poses, cm and degrees; None if one of them has none."""
+    if not (first.HasField("localization") and second.HasField("localization")):
         return None, None
-    was, is_now = wire.transform_from_message(first, "pose"), wire.transform_from_message(second, "pose")
+    was, is_now = (wire.transform_from_message(_pose_of(it.localization), "pose") for it in (first, second))
     centimetres = 100 * math.dist(was.translation, is_now.translation)
     return centimetres, rotation_angle_deg(was.rotation.T @ is_now.rotation)
+
+
+def _pose_of(found: Any) -> geometry_pb.RigidTransform:
+    if isinstance(found, pb.RigLocalization):
+        return found.world_from_rig
+    return found.world_from_camera if isinstance(found, pb.Localization) else found.poses[-1].world_from_camera

@@ -1,4 +1,4 @@
-"""Computes the answer of a captured call again, by the services and the method, on recorded inputs without a store.
+"""Computes the answer of a captured call again, by the services and the method, on its inputs and stored references.
 
 Computations run one after another without the queue and without deadlines. If time limited the captured answer, this
 one is limited in the same way: features that were not completed are not tried, and a pose that was not refined is not
@@ -6,20 +6,14 @@ refined.
 """
 
 import asyncio
-import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mapless.names import reference_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photo_views import QueryViews
@@ -36,10 +30,9 @@ from mapless_server.engine.query import (
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.search import Search, SearchJob, SearchStep
 from mapless_server.engine.stages import Method, QueryStages
-from mapless_server.errors import DataLoss
-from mapless_server.images import decode_image, decode_mask
+from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.features.extractors import FeatureExtractor
-from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
+from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.hypothesis import Attempt, Found, found_by
 from mapless_server.method.options import DoubtOptions, StageContext
 from mapless_server.method.pipeline import Coarse, coarse_answer
@@ -47,22 +40,19 @@ from mapless_server.method.solve import solve
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Selection
-from mapless_server.scenes.library import STORED_IMAGES, Loaded
+from mapless_server.scenes.library import Loaded, ReferenceLibrary
 from mapless_server.scheduling import Done, Flow, Job, Next
-from mapless_server.security import Principal, SceneKey, scene_id_of
+from mapless_server.security import Principal, SceneKey, key_of
 from mapless_server.services.capture.calls import (
     CapturedCall,
     CapturedPart,
-    CapturedReference,
     CaptureError,
-    DamagedCapture,
     Response,
     diagnostics_of,
 )
-from mapless_server.services.capture.files import blob_path
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.watching import Watchers
-from mapless_server.store import LruCache, SceneAttributes, Store, codec
+from mapless_server.store import DescribedReference, LruCache, ReferenceRecord, SceneAttributes, Store, codec
 
 Joined = TypeVar("Joined")
 
@@ -73,59 +63,46 @@ RETRIEVAL = "retrieval"
 _CACHE_BYTES = 512 * 2**20
 
 
-class Blobs:
-    """Photographs and features in a capture folder, cached; `found_anew` are keys whose features cannot be read."""
+class StoredReferences:
+    """References of captured calls in a store, which is only read: features that it lacks are kept in memory."""
 
-    def __init__(self, folder: Path) -> None:
-        self.found_anew: set[str] = set()
-        self._folder = folder
-        self._views: LruCache[View] = LruCache(_CACHE_BYTES)
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._library = ReferenceLibrary(store)
+        self._described: LruCache[DescribedReference] = LruCache(_CACHE_BYTES)
 
-    def view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
-        """The features of a reference: the captured ones, or else extracted again.
-
-        They are extracted again if this extractor's features were not captured, or if another version wrote them in a
-        form that this one cannot read; the latter is added to `found_anew`. DamagedCapture if they are missing or
-        damaged.
-        """
-        known = (reference.key, extractor.name)
-        view = self._views.get(known)
-        if view is None:
-            view = self._read_view(tenant, reference, extractor)
-            self._views.put(known, view, view.features.size_bytes)
-        return view
-
-    def pixels(self, tenant: str, reference: CapturedReference) -> NDArray[np.uint8]:
-        """A reference's photograph, (H, W, 3) RGB; DamagedCapture if it is missing or damaged."""
-        return decode_image(self._read(tenant, reference.image_sha256), STORED_IMAGES)
-
-    def ignored(self, tenant: str, reference: CapturedReference) -> Ignored | None:
-        """The ignored pixels of a reference's photograph; None for none. DamagedCapture as `pixels`."""
-        if not reference.mask_sha256:
-            return None
-        size = reference.camera.width_px, reference.camera.height_px
-        return decode_mask(self._read(tenant, reference.mask_sha256), size, STORED_IMAGES)
-
-    def _read_view(self, tenant: str, reference: CapturedReference, extractor: FeatureExtractor) -> View:
-        if extractor.name in reference.views:
-            data = self._read(tenant, reference.views[extractor.name])
-            try:
-                return codec.decode_view("", data, codec.sha256_for("", data))
-            except codec.Damaged:  # its bytes are as written, so it is the form that is unknown
-                self.found_anew.add(reference.key)
-        # As a store returns them, rounded: with the captured ones alike, the answer is the same bit for bit.
-        found = extractor.extract(self.pixels(tenant, reference), reference.camera, self.ignored(tenant, reference))
-        data = codec.encode_view(found)
-        return codec.decode_view("", data, codec.sha256_for("", data))
-
-    def _read(self, tenant: str, sha256: str) -> bytes:
+    def check(self, call: CapturedCall) -> None:
+        """Raises CaptureError, which names them, if references of a call were deleted or replaced since."""
+        keys = {name: key for part in call.parts for name, key in part.references.items()}
         try:
-            data = blob_path(self._folder, tenant, sha256).read_bytes()
-        except OSError as error:
-            raise DamagedCapture(f"blob {sha256}: {error.strerror}") from error
-        if hashlib.sha256(data).hexdigest() != sha256:
-            raise DamagedCapture(f"blob {sha256} is not what was written")
-        return data
+            present = self._store.find_keys(key_of(call.tenant, call.scene_id), list(keys)) if keys else {}
+        except NotFound as error:
+            raise CaptureError(f"scene {call.scene_id!r} was deleted since, or is in another store") from error
+        changed = [
+            f"{name!r} was {'replaced' if name in present else 'deleted'}"
+            for name, key in keys.items()
+            if present.get(name) != key
+        ]
+        if changed:
+            raise CaptureError(f"references of scene {call.scene_id!r} have changed since: {', '.join(changed)}")
+
+    def load(
+        self, scene_key: SceneKey, reference_ids: Sequence[str], extractor: FeatureExtractor
+    ) -> tuple[PosedView, ...]:
+        """Loads references with features of this extractor; DataLoss if one is damaged."""
+        snapshot = self._store.load_references(scene_key, reference_ids, extractor.name)
+        found = {it.record.reference_id: it for it in snapshot.references}
+        found |= {it.reference_id: self._describe(it, extractor) for it in snapshot.undescribed}
+        return tuple(self._library.posed_view(found[it]) for it in reference_ids)
+
+    def _describe(self, record: ReferenceRecord, extractor: FeatureExtractor) -> DescribedReference:
+        described = self._described.get((record.key, extractor.name))
+        if described is None:
+            # As a store returns them, rounded: then the answer is the same, bit for bit, as from stored ones.
+            data = codec.encode_view(self._library.extract(record, extractor))
+            described = DescribedReference(record, codec.decode_view("", data, codec.sha256_for("", data)))
+            self._described.put((record.key, extractor.name), described, len(data))
+        return described
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +115,7 @@ class RecordedSource:
 
     call: CapturedCall
     part: CapturedPart
-    blobs: Blobs
+    references: StoredReferences
     extractor: FeatureExtractor
     is_described: bool
     any_roll: str | None = None
@@ -152,12 +129,10 @@ class RecordedSource:
         waits: bool,
     ) -> Loaded:
         """Implements ReferenceSource with the captured references; others could not be read then either."""
-        by_id = {it.reference_id: it for it in self.part.references}
         for index, reference_id in enumerate(reference_ids):
-            if reference_id not in by_id:
+            if reference_id not in self.part.references:
                 raise DataLoss(f"reference {reference_id!r} was not captured", field=f"references[{index}]")
-        wanted = [by_id[reference_id] for reference_id in reference_ids]
-        return self.part.generation, tuple(self._posed_view(it, extractor, scene_key) for it in wanted)
+        return self.part.generation, self.references.load(scene_key, reference_ids, extractor)
 
     def attributes(self, scene_key: SceneKey) -> SceneAttributes:
         """Implements ReferenceSource."""
@@ -173,7 +148,7 @@ class RecordedSource:
     ) -> Choice:
         """The captured choice, by features for any roll where these choose; near a prior only if it was so chosen.
 
-        DamagedCapture if there is none.
+        CaptureError if there is none.
         """
         choices = self.part.choices
         if selection.near is not None:
@@ -181,7 +156,7 @@ class RecordedSource:
             return next(near, Choice((), POSE_PRIOR, self.part.generation))
         choices = tuple(it for it in choices if it.descriptor != POSE_PRIOR) or choices
         if not choices:
-            raise DamagedCapture("no choice of references was captured")
+            raise CaptureError("no choice of references was captured")
         wants_own = extractor is not None and extractor.name == self.any_roll
         if self.is_described:
             views.view(extractor if extractor is not None and wants_own else self.extractor, context)
@@ -192,14 +167,6 @@ class RecordedSource:
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Implements ReferenceSource: the reference was left out in the captured call, too."""
-
-    def _posed_view(self, reference: CapturedReference, extractor: FeatureExtractor, scene_key: SceneKey) -> PosedView:
-        tenant = self.call.tenant
-        view = self.blobs.view(tenant, reference, extractor)
-        read = partial(self.blobs.pixels, tenant, reference), partial(self.blobs.ignored, tenant, reference)
-        photograph = Photograph(lambda: reference.image_sha256, reference.camera, *read)
-        name = reference_name(scene_id_of(scene_key), reference.reference_id)
-        return PosedView(reference.key, name, replace(view, photograph=photograph), reference.world_from_camera)
 
 
 MESSAGES: dict[str, tuple[Any, Any]] = {
@@ -217,15 +184,18 @@ def response_of(call: CapturedCall) -> Response:
     return cast(Response, MESSAGES[call.method][1].FromString(call.response))
 
 
-def recompute(call: CapturedCall, blobs: Blobs, tiers: Sequence[Tier], options: EngineOptions) -> Response:
+def recompute(
+    call: CapturedCall, references: StoredReferences, tiers: Sequence[Tier], options: EngineOptions
+) -> Response:
     """Computes the answer to a captured call again, by present tiers, limits and defaults.
 
-    CaptureError if a part of the capture is missing, or its method is not known; RequestError or FieldError if the call
+    CaptureError if references have changed since, or the method is not known; RequestError or FieldError if the call
     is refused now.
     """
     then = response_of(call)
+    references.check(call)
     request = MESSAGES[call.method][0].FromString(call.request)
-    engine = cast(QueueEngine, _Recomputing(call, request, then, blobs, tiers, options))
+    engine = cast(QueueEngine, _Recomputing(call, request, then, references, tiers, options))
     service = LocalizationService(lambda: engine, Metrics(), cast(Store, _Attributes(call)), Watchers(False))
     now = Call(call.request_id, time.monotonic(), math.inf, Principal(tenant=call.tenant))
     return cast(Response, asyncio.run(getattr(service, call.method)(request, now)))
@@ -249,13 +219,13 @@ class _Recomputing:
         call: CapturedCall,
         request: Any,
         then: Response,
-        blobs: Blobs,
+        references: StoredReferences,
         tiers: Sequence[Tier],
         options: EngineOptions,
     ) -> None:
         self.options = options
         self._call = call
-        self._blobs = blobs
+        self._references = references
         self._tiers = tiers
         self._parts = {part.field: part for part in call.parts}
         described = zip(self._parts, diagnostics_of(then), strict=True)
@@ -268,7 +238,7 @@ class _Recomputing:
         field = query.photo.field
         extractor, part = self._tiers[0].extractor, self._parts[field]
         any_roll = next((it.features for it in self._tiers if it.any_roll), None)
-        recorded = RecordedSource(self._call, part, self._blobs, extractor, field in self._described, any_roll)
+        recorded = RecordedSource(self._call, part, self._references, extractor, field in self._described, any_roll)
         views = QueryViews(query.photo, self.options.image_limits)
         cuts = [(it.rung, it.features) for it in self._then[field].ladder_cuts if it.reason == _CALLER_FAILS]
         search = Search.begin(query, recorded, views, math.inf)

@@ -1,6 +1,7 @@
 """Computes a folder of captured calls again: which calls, and what has changed since."""
 
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -10,15 +11,21 @@ from mapless_server.engine.query import Tier
 from mapless_server.networks.weights import WeightsError, WeightsMissing
 from mapless_server.serve.assembly import engine_options, make_tiers, what_is_missing
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call
-from mapless_server.services.capture.files import calls_of, check_format
+from mapless_server.services.capture.folder import calls_of
 from mapless_server.services.capture.recorder import circumstances_of
 from mapless_server.settings import Settings
+from mapless_server.store import LruCache, Store, StoreError
+from mapless_server.store.backup import reading_backup
+from mapless_server.store.database import Database
+from mapless_server.store.migrations import read_version
+from mapless_server.store.tables import SCHEMA_VERSION
+from mapless_tools.stores import open_database_as_is
 
 from .comparing import Change, changed, compare, outcome_of, stage_seconds
-from .recompute import Blobs, recompute, response_of
+from .recompute import StoredReferences, recompute, response_of
 
 IDENTICAL, CHANGED, NOT_COMPUTED = "identical", "changed", "not computed"
-"""Verdicts on a call; the last: a part of the capture is damaged, or unknown to this version."""
+"""Verdicts on a call; the last: its references have changed since, or it is unknown to this version."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +37,6 @@ class Selection:
     tenant: str = ""
     scene_id: str = ""
 
-    def files(self, folder: Path) -> list[Path]:
-        """Files of the tenant and the scene, the latest first; CaptureError if a folder cannot be read."""
-        try:
-            found = {it: it.relative_to(folder).parts for it in calls_of(folder)}
-        except OSError as error:
-            raise CaptureError(f"{error.filename} cannot be read: {error.strerror}") from error
-        chosen = [
-            path
-            for path, (_, tenant, _, scene_id, _) in found.items()
-            if self.tenant in ("", tenant) and self.scene_id in ("", scene_id)
-        ]
-        return sorted(chosen, key=lambda it: it.name, reverse=True)
-
 
 @dataclass(frozen=True)
 class Replayed:
@@ -50,7 +44,7 @@ class Replayed:
 
     Outcomes are "localized" or the reason of the rejection, empty without an answer, for which `error` has the reason.
     Seconds are the computing time of all stages. Distances are None unless there are two poses, or if the answers are
-    identical. This version cannot read the captured features of `found_anew` references, and extracted them again.
+    identical.
     """
 
     request_id: str
@@ -69,7 +63,6 @@ class Replayed:
     apart_deg: float | None = None
     changes: tuple[Change, ...] = ()
     error: str = ""
-    found_anew: int = 0
 
 
 @dataclass(frozen=True)
@@ -86,48 +79,48 @@ class Report:
         return not self.unreadable and all(it.verdict == IDENTICAL for it in self.calls)
 
 
-def replay(folder: Path, selection: Selection, settings: Settings) -> Report:
+def replay(folder: Path, selection: Selection, settings: Settings, backup: Path | None = None) -> Report:
     """Computes captured answers of a folder again, whether a server uses it or not; nothing in it is changed.
 
-    Settings of listening and storing have no effect. CaptureError if the folder is not a capture folder or has no such
-    calls, or the settings name what is not available.
+    References are read from the settings' store, also while a server uses it, or from a backup of it. CaptureError if
+    the folder has no such calls, the store cannot be read, or the settings name what is not available.
     """
-    check_format(folder)
     unreadable: list[str] = []
-    found = select(folder, selection, unreadable)
+    paths = select(folder, selection, unreadable)
     calls, circumstances = [], dict[Change, None]()
     with ExitStack() as stack:
+        references = StoredReferences(stack.enter_context(_store(settings, backup)))
         tiers, options = _tiers(settings), engine_options(settings)
         for tier in tiers:
             stack.callback(tier.pipeline.matcher.close)
-        now, blobs = circumstances_of(settings, tiers), Blobs(folder)
-        for path in found:
-            call = _call_in(path, folder, unreadable)
-            if call is None:
-                continue
-            replayed = _replayed(call, blobs, tiers, options)
-            if replayed.error and not path.exists():  # its server deleted it, or a part of it, meanwhile
-                continue
-            circumstances |= dict.fromkeys(changed(call.circumstances, now))
-            calls.append(replayed)
+        now = circumstances_of(settings, tiers)
+        for path in paths:
+            call = _read(path, folder, unreadable)
+            if call is not None:
+                calls.append(_replayed(call, references, tiers, options))
+                circumstances |= dict.fromkeys(changed(call.circumstances, now))
     return Report(tuple(calls), tuple(circumstances), tuple(unreadable))
 
 
 def select(folder: Path, selection: Selection, unreadable: list[str]) -> list[Path]:
-    """Files of the calls, the oldest first; files that cannot be read are added to `unreadable`, selected or not."""
+    """Files of the calls, the oldest first; of those selected, files that cannot be read are added to `unreadable`."""
+    try:
+        paths = calls_of(folder)
+    except OSError as error:
+        raise CaptureError(f"{error.filename} cannot be read: {error.strerror}") from error
     found: list[Path] = []
-    ids: set[str] = set()
-    for path in selection.files(folder):
-        call = _call_in(path, folder, unreadable)
-        if call is None:
+    missing = set(selection.request_ids)
+    for path in reversed(paths):
+        tenant, _, scene_id, _ = path.parts[-4:]
+        if selection.tenant not in ("", tenant) or selection.scene_id not in ("", scene_id):
             continue
-        if not selection.request_ids or call.request_id in selection.request_ids:
+        call = _read(path, folder, unreadable)
+        if call is not None and (not selection.request_ids or call.request_id in selection.request_ids):
             found.append(path)
-            ids.add(call.request_id)
+            missing.discard(call.request_id)
         if len(found) == selection.last:
             break
-    missing = selection.request_ids - ids if selection.last is None or len(found) < selection.last else frozenset()
-    if missing or not (found or unreadable):
+    if (missing and len(found) != selection.last) or not (found or unreadable):
         which = f"call of id {', '.join(sorted(missing))}" if missing else "such calls"
         faults = f"; {len(unreadable)} files cannot be read" if unreadable else ""
         raise CaptureError(f"{folder} holds no {which}{faults}")
@@ -136,16 +129,36 @@ def select(folder: Path, selection: Selection, unreadable: list[str]) -> list[Pa
     return found[::-1]
 
 
-def _call_in(path: Path, folder: Path, unreadable: list[str]) -> CapturedCall | None:
+def _read(path: Path, folder: Path, unreadable: list[str]) -> CapturedCall | None:
     try:
         return decode_call(path.read_bytes())
     except FileNotFoundError:  # its server has deleted it since
         return None
-    except OSError as error:
-        unreadable.append(f"{path.relative_to(folder)}: {error.strerror}")
-    except CaptureError as error:
-        unreadable.append(f"{path.relative_to(folder)}: {error}")
-    return None
+    except (OSError, CaptureError) as error:
+        unreadable.append(f"{path.relative_to(folder)}: {getattr(error, 'strerror', None) or error}")
+        return None
+
+
+@contextmanager
+def _store(settings: Settings, backup: Path | None) -> Iterator[Store]:
+    try:
+        with reading_backup(backup) if backup else closing(open_database_as_is(settings)) as database:
+            _check_schema(database)
+            yield Store(database, LruCache(settings.reference_cache_mib * 2**20), name_cache_bytes=0)
+    except StoreError as error:
+        raise CaptureError(
+            f"{error}; name the store that answered (--data-dir), or a backup of it (--backup)"
+        ) from error
+
+
+def _check_schema(database: Database) -> None:
+    with database.read() as connection:
+        version = read_version(connection)
+    if version != SCHEMA_VERSION:
+        raise StoreError(
+            f"database {database.name} has schema version {version}, this program's is {SCHEMA_VERSION}: make a backup "
+            "with the program that serves it, which is read in this one's schema"
+        )
 
 
 def _tiers(settings: Settings) -> tuple[Tier, ...]:
@@ -157,14 +170,16 @@ def _tiers(settings: Settings) -> tuple[Tier, ...]:
         raise CaptureError(str(error)) from error
 
 
-def _replayed(call: CapturedCall, blobs: Blobs, tiers: tuple[Tier, ...], options: EngineOptions) -> Replayed:
+def _replayed(
+    call: CapturedCall, references: StoredReferences, tiers: tuple[Tier, ...], options: EngineOptions
+) -> Replayed:
     time = datetime.fromtimestamp(call.time_s, timezone.utc).isoformat(timespec="milliseconds")
     about = (call.request_id, time, call.method, call.tenant, call.scene_id)
     outcome_then, stages_then = "", dict[str, float]()
     try:
         then = response_of(call)
         outcome_then, stages_then = outcome_of(then), stage_seconds(then)
-        now = recompute(call, blobs, tiers, options)
+        now = recompute(call, references, tiers, options)
         comparison, stages_now = compare(then, now), stage_seconds(now)
     except Exception as error:  # one call that this version cannot compute does not stop the others
         name = "" if isinstance(error, CaptureError) else f"{type(error).__name__}: "
@@ -181,5 +196,4 @@ def _replayed(call: CapturedCall, blobs: Blobs, tiers: tuple[Tier, ...], options
         comparison.apart_cm,
         comparison.apart_deg,
         comparison.changes,
-        found_anew=len(blobs.found_anew & {key for _, key in call.keys}),
     )

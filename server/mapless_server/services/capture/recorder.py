@@ -1,10 +1,11 @@
 """Takes answered calls from the services and writes them to the folder, without delaying or failing any call.
 
-Calls wait for the disk in a queue that is bounded in number and bytes, and one thread writes them. What is not written
-is counted. `deletion` deletes them on time.
+Calls wait for the disk in a queue that is bounded in number and bytes, and one thread writes them and deletes old ones.
+What is not written is counted.
 """
 
 import logging
+import math
 import os
 import platform
 import sys
@@ -12,28 +13,22 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
-from google.protobuf.message import Message
-
-from mapless.names import parse_scene_name
+from mapless.names import parse_reference_name, parse_scene_name
 from mapless_server import __version__
 from mapless_server.engine.query import Query, Result, Tier
-from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.provenance import ROOT, commit_of, cpu_model
 from mapless_server.rpc import Call
 from mapless_server.scenes.observer import BackgroundObserver
-from mapless_server.security import check_tenant, key_of
+from mapless_server.security import check_tenant
 from mapless_server.settings import Settings
-from mapless_server.store import SceneAttributes, Store, time_us
 
-from .calls import BlobDeleted, CapturedCall, CaptureError, Request, Response, diagnostics_of
-from .collecting import Collector, ReferencesDeleted, UsedReferences, used_references
-from .deletion import Deletion
-from .folder import CaptureFolder, Retention
+from .calls import CapturedCall, CapturedPart, CaptureError, Request, Response, diagnostics_of
+from .folder import CaptureFolder
 
 log = logging.getLogger(__name__)
 
@@ -53,22 +48,13 @@ CLOSING_LIMIT_S = 5.0
 """For writing the queued calls when the server stops."""
 
 
-@dataclass(frozen=True, eq=False)
-class QueuedCall:
-    """A call that waits to be written, with both messages and their size, and the references of each photograph.
-
-    It was answered at `time_s`, Unix seconds; the tiers are all of the server.
-    """
-
-    call: Call
-    scene_id: str
-    time_s: float
-    request: Message
-    response: Message
-    size_bytes: int
-    parts: tuple[UsedReferences, ...]
-    attributes: SceneAttributes
-    tiers: Sequence[Tier]
+def captured_part(query: Query, result: Result) -> CapturedPart:
+    """Extracts what an answered photograph was compared with, by key only: a queued call needs little memory."""
+    choices = () if result.choice is None else (result.choice, *result.other_choices)
+    references = {it.reference_id: it.key for choice in choices for it in choice.references}
+    if not choices:
+        references = {parse_reference_name(it.name)[1]: it.key for it in result.references}
+    return CapturedPart(query.photo.field, result.generation, references, choices)
 
 
 class Recorder:
@@ -77,30 +63,25 @@ class Recorder:
     def __init__(
         self,
         folder: CaptureFolder,
-        store: Store,
         observer: BackgroundObserver,
         circumstances: Callable[[Sequence[Tier]], Mapping[str, str]] = lambda _: {},
         tenants: frozenset[str] = frozenset(),
     ) -> None:
-        """Starts the threads that write and delete.
+        """Starts the thread that writes and deletes; the folder is closed with the recorder.
 
-        Does not wait for the store, which is to be closed after the recorder. The folder is closed with the recorder.
         For `circumstances`, which also decide the tiers' answers, see `circumstances_of`. Only calls of the tenants are
         captured; of all, if there are none.
         """
         self.folder = folder
         self._observer = observer
         self._tenants = tenants
-        self._store = store.uncached()
-        self._collector = Collector(self._store, folder)
         self._circumstances = circumstances
         self._known_circumstances: Mapping[str, str] | None = None
-        self._queue: deque[QueuedCall] = deque()
+        self._queue: deque[tuple[CapturedCall, Sequence[Tier]]] = deque()
         self._queued_bytes = 0
         self._paused_until_s = 0.0
-        self._closing_s: float | None = None
+        self._closing_s = math.inf
         self._changed = threading.Condition()
-        self._deletion = Deletion(folder, self._store)
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
         self._thread.start()
 
@@ -114,29 +95,37 @@ class Recorder:
     ) -> None:
         """Queues an answered call for writing, with its photographs in order and their results.
 
-        Called on the event loop. The response's diagnostics are set to say whether the call is captured. Neither
-        message may change later.
+        Called on the event loop. The response's diagnostics are set to say whether the call is captured. The tiers are
+        all of the server.
         """
-        if self._tenants and call.principal.tenant not in self._tenants:
+        tenant = call.principal.tenant
+        if self._tenants and tenant not in self._tenants:
             return
-        messages: tuple[Message, Message] = request, response
-        size_bytes = sum(it.ByteSize() for it in messages)
-        used = tuple(used_references(*part) for part in parts)
-        attributes = parts[0][1].attributes
-        scene_id, now_s = parse_scene_name(request.scene), time.time()
-        if self._has_room(size_bytes):
-            for diagnostics in diagnostics_of(response):
-                diagnostics.captured = True
-            queued = QueuedCall(call, scene_id, now_s, *messages, size_bytes, used, attributes, tiers)
-            with self._changed:
-                self._queue.append(queued)
-                self._queued_bytes += size_bytes
-                self._changed.notify()
+        if reason := self._refusal(request.ByteSize() + response.ByteSize()):
+            self._drop(reason)
+            return
+        for diagnostics in diagnostics_of(response):
+            diagnostics.captured = True
+        captured = CapturedCall(
+            call.request_id,
+            time.time(),
+            type(request).__name__.removesuffix("Request"),
+            tenant,
+            parse_scene_name(request.scene),
+            attributes=parts[0][1].attributes,
+            parts=tuple(captured_part(*part) for part in parts),
+            request=request.SerializeToString(),
+            response=response.SerializeToString(),
+        )
+        with self._changed:
+            self._queue.append((captured, tiers))
+            self._queued_bytes += captured.size_bytes
+            self._changed.notify()
 
     @property
     def is_closing(self) -> bool:
         """Whether the recorder closes, so that only queued calls are still written."""
-        return self._closing_s is not None
+        return self._closing_s < math.inf
 
     def close(self) -> None:
         """Writes queued calls within `CLOSING_LIMIT_S`, and closes the folder; from any thread."""
@@ -144,91 +133,51 @@ class Recorder:
             self._closing_s = time.monotonic() + CLOSING_LIMIT_S
             self._changed.notify()
         self._thread.join()
-        self._deletion.close()
         self.folder.close()
 
-    def _has_room(self, size_bytes: int) -> bool:
-        """Whether another call may be queued; only the event loop adds calls."""
-        if self._is_paused():
-            self._drop("disk")
-            return False
-        with self._changed:
-            fits = not self._queue or self._queued_bytes + size_bytes <= MAX_QUEUED_BYTES
-            has_room = fits and len(self._queue) < MAX_QUEUED
-        if not has_room:
-            self._drop("queue")
-        return has_room
+    def _refusal(self, size_bytes: int) -> str:
+        """Why another call of this size cannot be queued; empty if it can. Only the event loop adds calls."""
+        if time.monotonic() < self._paused_until_s:
+            return "disk"
+        is_full = len(self._queue) >= MAX_QUEUED or self._queued_bytes + size_bytes > MAX_QUEUED_BYTES
+        return "queue" if self._queue and is_full else ""
 
     def _run(self) -> None:
+        pause_s = 0.0
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._queue or self.is_closing)
-                if not self._queue:
+                self._changed.wait_for(lambda: self._queue or self.is_closing, pause_s)
+                if self.is_closing and not self._queue:
                     return
-                queued = self._queue.popleft()
-                self._queued_bytes -= queued.size_bytes
-                is_late = self._closing_s is not None and time.monotonic() >= self._closing_s
-            if is_late:
-                self._drop("queue")
-            else:
-                self._write(queued)
+                call, tiers = self._queue.popleft() if self._queue else (None, ())
+                self._queued_bytes -= 0 if call is None else call.size_bytes
+            if call is not None:
+                self._write(call, tiers)
+            try:
+                pause_s = self.folder.tidy()
+            except Exception as error:  # must not end the deletion
+                log.error("captured calls that are too old cannot be deleted: %s", error, exc_info=error)
+                pause_s = 1.0
 
-    def _is_paused(self) -> bool:
-        return time.monotonic() < self._paused_until_s
-
-    def _write(self, queued: QueuedCall) -> None:
-        if self._is_paused():
-            self._drop("disk")
+    def _write(self, call: CapturedCall, tiers: Sequence[Tier]) -> None:
+        now_s = time.monotonic()
+        if now_s < self._paused_until_s or now_s >= self._closing_s:
+            self._drop("disk" if now_s < self._paused_until_s else "queue")
             return
         try:
-            if self._add(queued):
+            if self._known_circumstances is None:
+                self._known_circumstances = self._circumstances(tiers)
+            if self.folder.add(replace(call, circumstances=self._known_circumstances)):
                 self._observer.count("captured")
             else:
                 self._drop("size")
-        except OSError as error:
+        except (OSError, CaptureError) as error:
             self._paused_until_s = time.monotonic() + FAULT_PAUSE_S
             self._drop("disk")
             log.error("nothing is captured for %g s: %s", FAULT_PAUSE_S, error)
-        except (ReferencesDeleted, NotFound):
-            self._drop("deleted")
-        except (DataLoss, Unavailable):
-            self._drop("store")
         except Exception as error:
             self._drop("fault")
-            log.error(
-                "capturing a call failed: %s", error, exc_info=error, extra={"request_id": queued.call.request_id}
-            )
-
-    def _add(self, queued: QueuedCall, more_tries: int = 2) -> bool:
-        try:
-            return self.folder.add(*self._collect(queued))
-        except BlobDeleted:
-            if not more_tries:
-                raise
-            return self._add(queued, more_tries - 1)
-
-    def _collect(self, queued: QueuedCall) -> tuple[CapturedCall, dict[str, bytes]]:
-        if self._known_circumstances is None:
-            self._known_circumstances = self._circumstances(queued.tiers)
-        tenant = queued.call.principal.tenant
-        extractors, blobs = tuple(tier.features for tier in queued.tiers), dict[str, bytes]()
-        # First, so that a scene that is created anew while its references are read is found to have others.
-        scene = self._store.get_scene(key_of(tenant, queued.scene_id))
-        parts = tuple(self._collector.part(scene, used, extractors, blobs) for used in queued.parts)
-        call = CapturedCall(
-            queued.call.request_id,
-            queued.time_s,
-            type(queued.request).__name__.removesuffix("Request"),
-            tenant,
-            queued.scene_id,
-            time_us(scene.create_time),
-            self._known_circumstances,
-            queued.attributes,
-            parts,
-            queued.request.SerializeToString(),
-            queued.response.SerializeToString(),
-        )
-        return call, blobs
+            log.error("capturing a call failed: %s", error, exc_info=error, extra={"request_id": call.request_id})
 
     def _drop(self, reason: str) -> None:
         self._observer.count("capture_dropped", 1, reason)
@@ -261,7 +210,7 @@ def _version_of(package: str) -> str:
         return ""
 
 
-def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorder | None:
+def open_recorder(settings: Settings, metrics: Metrics) -> Recorder | None:
     """Opens the recorder if the settings want one; logs a warning, since photographs are then stored.
 
     CaptureError if the folder cannot be used, or capture_tenants has an invalid name.
@@ -272,7 +221,7 @@ def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorde
         tenants = frozenset(check_tenant(it) for it in settings.capture_tenants.split(",") if it)
     except ValueError as error:
         raise CaptureError(f"capture_tenants: {error}") from None
-    folder = CaptureFolder(settings.capture_dir, Retention(3600 * settings.capture_hours, settings.capture_mib * 2**20))
+    folder = CaptureFolder(settings.capture_dir, 3600 * settings.capture_hours, settings.capture_mib * 2**20)
     log.warning(
         "calls are captured, photographs and all: %s, for %g hours, %d MiB at most",
         settings.capture_dir,
@@ -280,4 +229,4 @@ def open_recorder(settings: Settings, store: Store, metrics: Metrics) -> Recorde
         settings.capture_mib,
     )
     metrics.watch_captures(lambda: folder.disk_bytes)
-    return Recorder(folder, store, metrics, partial(circumstances_of, settings), tenants)
+    return Recorder(folder, metrics, partial(circumstances_of, settings), tenants)
