@@ -1,22 +1,28 @@
-"""The images and the compose files match the code: ports, settings, times, folders; and nothing is left unprotected.
+"""The Dockerfile and the compose files: valid, confined, with settings that the server takes, and a server that starts.
 
-No container engine is needed: the files are read. What is true of an image holds for every target of the Dockerfile.
+hadolint checks the Dockerfile, the compose specification's schema the compose files. No container engine is needed.
 """
 
 import json
 import logging
+import os
 import re
 import shlex
+import signal
+import subprocess
 import sys
-from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
+import jsonschema
 import pytest
 import yaml  # type: ignore[import-untyped]
 from sqlalchemy import make_url
+from support.waiting import LIMIT_S, wait_until
 
-from mapless.cli.arguments import make_parser
+from bench.load.driving import free_port
 from mapless_server.security import assess_binding
 from mapless_server.settings import PREFIX, Settings, load_settings
 from mapless_server.store.postgresql import CONNECTIONS_AT_MOST
@@ -27,43 +33,17 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).parents[2]
-DOCKERFILE = ROOT / "docker" / "Dockerfile"
 DEPLOY = ROOT / "deploy"
-PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-PROJECT = PYPROJECT["project"]
-TARGETS = ["cpu", "cuda"]
+DOCKERFILE = ROOT / "docker" / "Dockerfile"
+PROGRAMS = Path(sys.executable).parent
+HADOLINT = PROGRAMS / "hadolint"
+TEXT = re.sub(r"\\\n\s*", "", re.sub(r"(?m)^#.*\n", "", DOCKERFILE.read_text()))
+STAGES = {name: stage for stage in TEXT.split("\nFROM ")[1:] for name in re.findall(r"^\S+ AS (\S+)", stage)}
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PINNED = re.compile(r"([\w./-]+:v?\d+\.\d+|postgres:\d+)\.\d+[\w.-]*(@sha256:[0-9a-f]{64})?")
 """PostgreSQL's versions have two numbers since 10."""
 
 Json = dict[str, Any]
-Instruction = tuple[str, str]
-
-
-def parse(dockerfile: str) -> list[Instruction]:
-    """The instructions, without comments and with continued lines joined."""
-    lines = [line for line in dockerfile.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    joined = re.sub(r"\\\n\s*", "", "\n".join(lines))
-    return [(word.upper(), rest.strip()) for word, _, rest in (line.partition(" ") for line in joined.splitlines())]
-
-
-def stages_of(instructions: list[Instruction]) -> dict[str, tuple[str, list[Instruction]]]:
-    """By name: what each stage builds on, and its instructions."""
-    stages: dict[str, tuple[str, list[Instruction]]] = {}
-    here: list[Instruction] = []
-    for word, rest in instructions:
-        if word == "FROM":
-            base, _, name = rest.partition(" AS ")
-            assert name not in stages
-            assert base == "${PYTHON_IMAGE}" or base in stages, f"{base} comes later, or is no stage"
-            here = []
-            stages[name] = (base, here)
-        else:
-            here.append((word, rest))
-    return stages
-
-
-INSTRUCTIONS = parse(DOCKERFILE.read_text())
-STAGES = stages_of(INSTRUCTIONS)
 
 
 class Overriding(list[Any]):
@@ -75,12 +55,6 @@ class ComposeLoader(yaml.SafeLoader):  # type: ignore[misc]
 
 
 ComposeLoader.add_constructor("!override", lambda loader, node: Overriding(loader.construct_sequence(node)))
-
-
-def compose_file(name: str) -> Json:
-    """One of the compose files, by itself."""
-    document: Json = yaml.load((DEPLOY / name).read_text(), ComposeLoader)
-    return document
 
 
 def merged(below: Any, above: Any) -> Any:
@@ -95,38 +69,27 @@ def merged(below: Any, above: Any) -> Any:
     return above
 
 
-COMPOSE, CUDA, POSTGRES = map(compose_file, ("compose.yaml", "compose.cuda.yaml", "compose.postgres.yaml"))
+FILES = {it.name: yaml.load(it.read_text(), ComposeLoader) for it in sorted(DEPLOY.glob("compose*.yaml"))}
+COMPOSE, CUDA, POSTGRES = (FILES[f"compose{it}.yaml"] for it in ("", ".cuda", ".postgres"))
 SHARED = merged(COMPOSE, POSTGRES)
+TOGETHER = {"cpu": COMPOSE, "cuda": merged(COMPOSE, CUDA), "shared": SHARED, "both": merged(SHARED, CUDA)}
 
 
-def chain(target: str) -> list[Instruction]:
-    """All instructions that make a target, those of its bases first."""
-    base, own = STAGES[target]
-    return (chain(base) if base in STAGES else []) + own
+def all_of(stage: str, word: str) -> list[str]:
+    """What follows an instruction in a stage and in those that it is built on, theirs first."""
+    base = re.match(r"(\S+) AS", STAGES[stage])[1]  # type: ignore[index]
+    return (all_of(base, word) if base in STAGES else []) + re.findall(rf"(?m)^{word} (.*)", STAGES[stage])
 
 
-def all_of(target: str, word: str) -> list[str]:
-    return [rest for found, rest in chain(target) if found == word]
+def environment_of(stage: str) -> dict[str, str]:
+    return dict(pair.split("=", 1) for line in all_of(stage, "ENV") for pair in shlex.split(line))
 
 
-def arguments_of(stage: str) -> list[tuple[str, str, str]]:
-    """Names and defaults of a stage's own arguments."""
-    return [rest.partition("=") for word, rest in STAGES[stage][1] if word == "ARG"]
-
-
-def environment_of(target: str) -> dict[str, str]:
-    pairs = [pair.partition("=") for line in all_of(target, "ENV") for pair in shlex.split(line)]
-    return {name: value for name, _, value in pairs}
-
-
-def ours(environment: Json) -> dict[str, str]:
-    return {name: str(value) for name, value in environment.items() if name.startswith(PREFIX)}
-
-
-def settings_under(environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Settings:
-    """What the server makes of variables; an unknown name or a wrong value raises."""
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
+def settings_under(given: Json, monkeypatch: pytest.MonkeyPatch) -> Settings:
+    """What the server makes of the image's variables and these; an unknown name or a wrong value raises."""
+    for name, value in (environment_of("cpu") | given).items():
+        if name.startswith(PREFIX):
+            monkeypatch.setenv(name, str(value))
     return load_settings({}).settings
 
 
@@ -135,180 +98,140 @@ def seconds(text: str) -> float:
     return float(number) * {"s": 1, "m": 60}[unit]
 
 
-def services() -> Iterator[tuple[str, Json]]:
-    """What runs when all files but the GPU's are put together."""
-    yield from SHARED["services"].items()
+@pytest.mark.skipif(not HADOLINT.is_file(), reason="hadolint has no wheel for this machine")
+def test_hadolint_finds_no_fault_in_the_dockerfile() -> None:
+    # Not DL3008: a compiler's version is the base image's.
+    said = subprocess.run([HADOLINT, "--ignore", "DL3008", DOCKERFILE], capture_output=True, text=True, timeout=60)
+    assert (said.returncode, said.stdout) == (0, "")
 
 
-# The Dockerfile
-
-
-def test_the_base_is_pinned() -> None:
-    (base,) = [
-        rest.removeprefix("PYTHON_IMAGE=")
-        for word, rest in INSTRUCTIONS
-        if (word, rest[:13]) == ("ARG", "PYTHON_IMAGE=")
-    ]
-    assert PINNED.fullmatch(base)
-    assert set(TARGETS) <= set(STAGES)
+@pytest.mark.parametrize("name", FILES)
+def test_compose_files_keep_to_the_specification(name: str) -> None:
+    pytest.importorskip("check_jsonschema", reason="needs check-jsonschema, of the extra `dev`")
+    schema = json.loads((files("check_jsonschema.builtin_schemas") / "vendor/compose-spec.json").read_text())
+    jsonschema.validate(FILES[name], schema)
 
 
 def test_what_is_copied_exists_and_reaches_the_build() -> None:
-    ignored, *let_through = [
-        line for line in (DOCKERFILE.parent / "Dockerfile.dockerignore").read_text().splitlines() if line[0] != "#"
-    ]
-    assert ignored == "*"
-    copied = [rest.split() for word, rest in INSTRUCTIONS if word == "COPY"]
-    for *sources, _ in copied:
-        if sources[0].startswith("--from="):
-            assert sources[0].removeprefix("--from=") in STAGES
-            continue
-        for source in sources:
+    assert PINNED.fullmatch(re.findall(r"ARG PYTHON_IMAGE=(.*)", DOCKERFILE.read_text())[0])
+    let_through = (DOCKERFILE.parent / "Dockerfile.dockerignore").read_text().splitlines()
+    for line in re.findall(r"(?m)^COPY (?!--from)(.*) \S+$", TEXT):
+        for source in line.split():
             assert (ROOT / source).exists()
             assert f"!{source}" in let_through
 
 
-@pytest.mark.parametrize("target", TARGETS)
-def test_an_image_runs_the_server_without_root(target: str) -> None:
-    uid, gid = all_of(target, "USER")[-1].split(":")
-    assert int(uid) > 0 < int(gid)  # a number, since only that lets Kubernetes see that it is not root
-    assert chain(target)[-1][0] == "USER"
-    command = json.loads(all_of(target, "ENTRYPOINT")[-1]) + json.loads(all_of(target, "CMD")[-1])
-    assert command == ["mapless-server", "serve"]
-    assert command[0] in PROJECT["scripts"]
-    assert all_of(target, "STOPSIGNAL") == ["SIGTERM"]
-    assert all_of(target, "EXPOSE") == [f"{default('port')} {default('metrics_port')}"]
-
-
-@pytest.mark.parametrize("target", TARGETS)
-def test_an_image_checks_its_health_with_our_client(target: str) -> None:
-    (check,) = all_of(target, "HEALTHCHECK")
-    options, _, command = check.partition(" CMD ")
-    program, *arguments = json.loads(command)
-    parsed = make_parser().parse_args(arguments)
-    assert program in PROJECT["scripts"]
-    assert parsed.run.__name__ == "health"
-    assert parsed.address == f"localhost:{default('port')}"
-    assert parsed.timeout < seconds(re.search(r"--timeout=(\w+)", options)[1])  # type: ignore[index]
-
-
-@pytest.mark.parametrize("target", TARGETS)
-def test_an_image_sets_known_settings_and_none_of_security(target: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = settings_under(ours(environment_of(target)), monkeypatch)
-    assert (settings.tls_certificate, settings.tokens_file, settings.insecure) == (None, None, False)
-    assert assess_binding(settings)[0] == logging.CRITICAL
+@pytest.mark.parametrize("stage", ["cpu", "cuda"])
+def test_an_image_serves_without_root_or_open_doors(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert re.fullmatch(r"[1-9]\d*:[1-9]\d*", all_of(stage, "USER")[-1])  # numbers show Kubernetes that it is not root
+    assert json.loads(all_of(stage, "ENTRYPOINT")[-1]) + json.loads(all_of(stage, "CMD")[-1]) == [
+        "mapless-server",
+        "serve",
+    ]
+    settings = settings_under(environment_of(stage), monkeypatch)
+    assert all_of(stage, "EXPOSE") == [f"{settings.port} {settings.metrics_port}"]
     assert settings.metrics_host == settings.host == "0.0.0.0"
-
-
-@pytest.mark.parametrize("target", TARGETS)
-def test_what_an_image_writes_to_is_a_volume(target: str) -> None:
-    environment = environment_of(target)
-    volumes = json.loads(all_of(target, "VOLUME")[-1])
+    assert assess_binding(settings)[0] == logging.CRITICAL
+    volumes = json.loads(all_of(stage, "VOLUME")[-1])
     for name in ("MAPLESS_DATA_DIR", "MAPLESS_WEIGHTS_DIR", "HOME", "XDG_CACHE_HOME", "TORCHINDUCTOR_CACHE_DIR"):
-        assert any(environment[name] == volume or environment[name].startswith(volume + "/") for volume in volumes)
-    (created,) = [line.partition("install --directory ")[2] for line in all_of("runtime", "RUN")]
-    assert set(volumes) == {word for word in created.split() if word.startswith("/")}
+        assert any(environment_of(stage)[name].startswith(volume) for volume in volumes)
+        assert all(f" {volume}" in all_of("runtime", "RUN")[0] for volume in volumes)
 
 
-def test_versions_and_extras_are_the_projects() -> None:
-    arguments = [argument for stage in STAGES for argument in arguments_of(stage)]
-    assert [value for name, _, value in arguments if name == "VERSION"] == [PROJECT["version"]]
-    for extras in [value for name, _, value in arguments if name == "EXTRAS"]:
-        assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
-    for stage in ("build-cpu", "build-cuda"):  # what the documentation recommends runs in both
-        (extras,) = [value for name, _, value in arguments_of(stage) if name == "EXTRAS"]
-        assert "networks" in extras.split(",")
+def test_extras_and_torch_are_the_projects() -> None:
     (torch,) = re.findall(r"^TORCH_VERSION := (.*)", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    assert [value for name, _, value in arguments if name == "TORCH"] == [f"torch=={torch}"] * len(TARGETS)
-
-
-# Compose
+    for stage in ("build-cpu", "build-cuda"):
+        (extras,) = re.findall(r"(?m)^ARG EXTRAS=(.*)", STAGES[stage])
+        assert {"server", "networks"} <= set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
+        assert re.findall(r"(?m)^ARG TORCH=(.*)", STAGES[stage]) == [f"torch=={torch}"]
 
 
 def test_what_compose_refers_to_exists() -> None:
-    used = set()
-    for _, service in services():
-        for volume in service["volumes"]:
-            source = volume.split(":")[0]
-            if source.startswith("."):
-                assert (DEPLOY / source).is_dir()
-            else:
-                used.add(source)
+    sources = [it.split(":")[0] for service in SHARED["services"].values() for it in service["volumes"]]
+    assert all((DEPLOY / it).is_dir() for it in sources if it.startswith("."))
+    assert {it for it in sources if not it.startswith(".")} == set(SHARED["volumes"])
+    for service in SHARED["services"].values():
         assert set(service.get("depends_on", ())) <= set(SHARED["services"])
-    assert used == set(SHARED["volumes"])
-    assert "postgres" not in COMPOSE["volumes"]
-    (config,) = [word for word in COMPOSE["services"]["prometheus"]["command"] if word.startswith("--config.file=")]
-    assert (DEPLOY / "prometheus" / Path(config).name).is_file()
-    assert f"./prometheus:{Path(config.partition('=')[2]).parent}:ro" in COMPOSE["services"]["prometheus"]["volumes"]
-
-
-@pytest.mark.parametrize(("document", "target"), [(COMPOSE, "cpu"), (CUDA, "cuda")], ids=TARGETS)
-def test_compose_builds_a_target_of_the_dockerfile(document: Json, target: str) -> None:
-    service = document["services"]["mapless"]
-    assert service["build"]["target"] == target
-    assert service["image"] == f"mapless:{PROJECT['version']}-{target}"
+    for stage, document in (("cpu", COMPOSE), ("cuda", CUDA)):
+        server = document["services"]["mapless"]
+        assert (server["build"]["target"], server["image"]) == (stage, f"mapless:{PROJECT['version']}-{stage}")
     build = COMPOSE["services"]["mapless"]["build"]
     assert (DEPLOY / build["context"] / build["dockerfile"]).resolve() == DOCKERFILE
 
 
-@pytest.mark.parametrize(("name", "service"), list(services()))
-def test_every_service_is_confined(name: str, service: Json) -> None:
+@pytest.mark.parametrize("name", SHARED["services"])
+def test_every_service_is_confined(name: str) -> None:
+    service = SHARED["services"][name]
     assert PINNED.fullmatch(service["image"])
-    assert service["read_only"] is True
-    assert service["cap_drop"] == ["ALL"]
+    assert (service["read_only"], service["cap_drop"]) == (True, ["ALL"])
     assert service["security_opt"] == ["no-new-privileges:true"]
     assert service["cpus"] > 0
     assert re.fullmatch(r"\d+[mg]", service["mem_limit"])
     assert all(port.startswith("127.0.0.1:") for port in service["ports"])
-    if name != "mapless":  # whose image has one
-        assert service["healthcheck"]["test"][0] == "CMD"
+    assert name == "mapless" or service["healthcheck"]["test"][0] == "CMD"  # whose image has one
 
 
-@pytest.mark.parametrize(
-    "document", [COMPOSE, merged(COMPOSE, CUDA), SHARED, merged(SHARED, CUDA)], ids=["cpu", "cuda", "shared", "both"]
-)
-def test_compose_runs_the_server_within_its_means(document: Json, monkeypatch: pytest.MonkeyPatch) -> None:
-    service = document["services"]["mapless"]
-    settings = settings_under(ours(environment_of("cpu")) | ours(service["environment"]), monkeypatch)
+@pytest.mark.parametrize("name", TOGETHER)
+def test_compose_runs_the_server_within_its_means(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    service = TOGETHER[name]["services"]["mapless"]
+    settings = settings_under(service["environment"], monkeypatch)
     assert settings.workers == service["cpus"]
+    count = service.get("deploy", {}).get("replicas", 1)
     (published,) = service["ports"]
-    address, first, last, port = re.fullmatch(r"(.*):(\d+)(?:-(\d+))?:(\d+)", published).groups()  # type: ignore[union-attr]
-    assert (address, int(first), int(port)) == ("127.0.0.1", settings.port, settings.port)
-    assert int(last or first) - int(first) + 1 == service.get("deploy", {}).get("replicas", 1)  # a port each
+    last = f"-{settings.port + count - 1}" if count > 1 else ""  # a port each
+    assert published == f"127.0.0.1:{settings.port}{last}:{settings.port}"
     assert assess_binding(settings)[0] == logging.WARNING  # open, since only this machine reaches it
     assert seconds(service["stop_grace_period"]) > settings.drain_delay_s + settings.drain_grace_s
     mounted = {volume.split(":")[1] for volume in service["volumes"]} | set(service["tmpfs"])
     assert mounted == {*json.loads(all_of("cpu", "VOLUME")[-1]), "/tmp"}
-
-
-def test_a_store_of_its_own_has_one_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    service = COMPOSE["services"]["mapless"]
-    assert settings_under(ours(service["environment"]), monkeypatch).database_url is None
-    assert "replicas" not in service.get("deploy", {})
+    assert (settings.database_url is None) is (count == 1)  # a store of its own has one server
 
 
 def test_servers_of_compose_reach_the_database_that_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By name, port, user and password; it has room for all their connections, and accepts no other user."""
+    """By name, port, user and password, which comes from outside; it has room for all their connections."""
     server, database = SHARED["services"]["mapless"], SHARED["services"]["postgres"]
-    settings = settings_under(ours(server["environment"]), monkeypatch)
+    settings = settings_under(server["environment"], monkeypatch)
     assert settings.database_url is not None
-    url = make_url(settings.database_url.get_secret_value())
-    made = database["environment"]
+    url, made = make_url(settings.database_url.get_secret_value()), database["environment"]
     assert (url.host, url.port, url.drivername) == ("postgres", 5432, "postgresql")
     assert (url.username, url.database) == (made["POSTGRES_USER"], made["POSTGRES_DB"])
     assert made["POSTGRES_PASSWORD"] == url.password
-    assert re.fullmatch(r"\$\{POSTGRES_PASSWORD:\?[^}]+\}", str(url.password))  # from outside, or nothing starts
+    assert re.fullmatch(r"\$\{POSTGRES_PASSWORD:\?[^}]+\}", str(url.password))
     assert ".env" in (ROOT / ".gitignore").read_text().splitlines()
     assert server["depends_on"]["postgres"] == {"condition": "service_healthy"}
-    assert database["ports"] == []
-    assert int(database["user"].split(":")[0]) > 0
+    assert (database["ports"], database["user"]) == ([], "70:70")
     options = dict(word.removeprefix("--").split("=") for word in database["command"] if word.startswith("--"))
     reserved = 3  # for superusers, PostgreSQL's default
     assert int(options["max_connections"]) >= server["deploy"]["replicas"] * CONNECTIONS_AT_MOST + reserved
     assert not {"fsync", "full_page_writes", "synchronous_commit"} & set(options)
-    memory_mib = {"m": 1, "g": 1024}[database["mem_limit"][-1]] * int(database["mem_limit"][:-1])
-    assert int(options["shared_buffers"].removesuffix("MB")) <= memory_mib / 4
 
 
-def default(setting: str) -> Any:
-    return Settings.model_fields[setting].default
+def test_the_server_starts_as_compose_starts_it(tmp_path: Path) -> None:
+    """With the image's variables, and health, probes and end as they are deployed; on ports and folders of the test."""
+    compose = COMPOSE["services"]["mapless"]
+    port, metrics_port = free_port(), free_port()
+    here = {"MAPLESS_HOST": "127.0.0.1", "MAPLESS_METRICS_HOST": "127.0.0.1", "MAPLESS_PORT": str(port)}
+    here |= {
+        "MAPLESS_METRICS_PORT": str(metrics_port),
+        "MAPLESS_DATA_DIR": str(tmp_path),
+        "MAPLESS_WEIGHTS_DIR": str(tmp_path),
+    }
+    variables = {
+        it: str(value) for it, value in (environment_of("cpu") | compose["environment"]).items() if it[:8] == PREFIX
+    }
+    environment = os.environ | variables | here | {"MAPLESS_ADDRESS": f"localhost:{port}"}
+    program, *arguments = json.loads(all_of("cpu", "ENTRYPOINT")[-1]) + json.loads(all_of("cpu", "CMD")[-1])
+    (check,) = all_of("cpu", "HEALTHCHECK")
+    client, *asked = json.loads(check.partition(" CMD ")[2])
+    with subprocess.Popen([PROGRAMS / program, *arguments], env=environment) as server:
+        try:
+            health = [PROGRAMS / client, *asked]
+            wait_until(lambda: subprocess.run(health, env=environment, capture_output=True, timeout=60).returncode == 0)
+            manifests = "".join(it.read_text() for it in (DEPLOY / "kubernetes").rglob("statefulset.yaml"))
+            for path in {*re.findall(r"path: (/\w+)$", manifests, re.MULTILINE), "/metrics"}:
+                with urlopen(f"http://127.0.0.1:{metrics_port}{path}", timeout=LIMIT_S) as answer:
+                    assert answer.status == 200, path
+            server.send_signal(getattr(signal, all_of("cpu", "STOPSIGNAL")[-1]))
+            assert server.wait(seconds(compose["stop_grace_period"])) == 0
+        finally:
+            server.kill()

@@ -5,6 +5,7 @@ there stays empty for ever, without any error.
 """
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -31,6 +32,8 @@ RULES = [
 ]
 ALERTS = [rule for rule in RULES if "alert" in rule]
 RECORDED = {rule["record"]: rule["expr"] for rule in RULES if "record" in rule}
+PROMETHEUS = yaml.safe_load((DEPLOY / "prometheus/prometheus.yaml").read_text())
+SERVICES = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
 PANELS = [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
 TARGET_LABELS = {"job": "mapless", "instance": "a:9464", "namespace": "mapless", "pod": "mapless-0"}
 """What Prometheus adds to every series."""
@@ -117,31 +120,24 @@ def selectors(expression: str) -> list[promql_parser.VectorSelector]:
     return [node for node in nodes(expression) if isinstance(node, promql_parser.VectorSelector)]
 
 
-def test_every_selector_finds_a_series() -> None:
-    for where, expression in EXPRESSIONS:
-        assert selectors(expression), where
-        for selector in selectors(expression):
-            assert SERIES.found_by(selector), f"{where}: nothing is {selector}"
-
-
-def test_every_value_that_is_asked_for_is_one_that_there_is() -> None:
-    """A misspelt alternative, INTERNAL|UNKOWN, is not noticed. grpc itself answers with UNKNOWN, we do not."""
-    for where, selector in [(where, selector) for where, it in EXPRESSIONS for selector in selectors(it)]:
+@pytest.mark.parametrize(("where", "expression"), EXPRESSIONS, ids=[where for where, _ in EXPRESSIONS])
+def test_series_values_and_labels_that_are_asked_for_exist(where: str, expression: str) -> None:
+    """Also each alternative: Prometheus ignores a misspelt one, INTERNAL|UNKOWN. UNKNOWN is grpc's own, never ours."""
+    assert selectors(expression)
+    labels_there = set()
+    for selector in selectors(expression):
+        found = SERIES.found_by(selector)
+        assert found, f"nothing is {selector}"
+        labels_there |= {name for labels in found for name in labels}
         for matcher in selector.matchers.matchers:
-            there = {labels.get(matcher.name, "") for labels in SERIES.by_name[selector.name or ""]} | {"UNKNOWN"}
+            values = {labels.get(matcher.name, "") for labels in SERIES.by_name[selector.name or ""]} | {"UNKNOWN"}
             for alternative in matcher.value.split("|"):
-                found = any(re.fullmatch(alternative, value) for value in there)
-                assert found, f"{where}: {matcher.name} is never {alternative}"
-
-
-def test_every_label_that_is_grouped_by_is_one_that_there_is() -> None:
-    for where, expression in EXPRESSIONS:
-        there = {name for selector in selectors(expression) for labels in SERIES.found_by(selector) for name in labels}
-        for node in nodes(expression):
-            if isinstance(node, promql_parser.AggregateExpr) and node.modifier is not None:
-                assert set(node.modifier.labels) <= there, where
-            if isinstance(node, promql_parser.BinaryExpr) and node.modifier is not None and node.modifier.matching:
-                assert set(node.modifier.matching.labels) <= there, where
+                assert any(re.fullmatch(alternative, it) for it in values), f"{matcher.name} is never {alternative}"
+    for node in nodes(expression):
+        if isinstance(node, promql_parser.AggregateExpr) and node.modifier is not None:
+            assert set(node.modifier.labels) <= labels_there
+        if isinstance(node, promql_parser.BinaryExpr) and node.modifier is not None and node.modifier.matching:
+            assert set(node.modifier.matching.labels) <= labels_there
 
 
 def test_counters_are_not_read_as_they_are() -> None:
@@ -156,104 +152,83 @@ def test_counters_are_not_read_as_they_are() -> None:
         }, where
 
 
-# Alerts
+# Alerts and Prometheus
 
 
-def test_every_alert_has_a_severity_and_is_in_the_runbook() -> None:
-    names = [rule["alert"] for rule in ALERTS]
-    assert len(set(names)) == len(names)
-    for rule in ALERTS:
-        assert rule["labels"]["severity"] in ("page", "ticket")
-        assert rule["annotations"]["summary"]
-    runbook = (DEPLOY.parent / "docs/operation/alerts.md").read_text()
-    in_runbook = re.findall(r"`(Mapless\w+)`", "".join(re.findall(r"^\| `Mapless.*", runbook, re.MULTILINE)))
-    assert sorted(in_runbook) == sorted(names)
+def promtool(*arguments: str, given: bytes = b"") -> bytes:
+    """What Prometheus's own checks say; an error if they find a fault."""
+    program = shutil.which("promtool")
+    if program is None:
+        assert os.environ.get("TEST_PROMTOOL") != "required"
+        pytest.skip("promtool, of Prometheus, is not here")
+    return subprocess.run([program, *arguments], input=given, check=True, capture_output=True, timeout=60).stdout
 
 
-def test_burn_rates_are_of_one_objective() -> None:
-    """The panel's line, the alerts' thresholds and what the comment says of them."""
-    text = (DEPLOY / "prometheus/alerts.yaml").read_text()
-    assert "99.5 %" in text
-    for rule in ALERTS:
-        if rule["alert"].startswith("MaplessErrors"):
-            assert {float(number) for number in re.findall(r"0\.\d+", rule["expr"])} == {0.005}
-            assert len([it for it in selectors(rule["expr"]) if "ratio_rate" in (it.name or "")]) == 2
-    (burn,) = [panel for panel in PANELS if panel["title"].startswith("Burn rate")]
-    assert all(target["expr"].endswith("/ 0.005") for target in burn["targets"])
-    windows = {name: re.findall(r"\[(\w+)\]", expr) for name, expr in RECORDED.items()}
-    assert all(set(found) == set(re.findall(r"(?:ratio_rate|increase)(\w+)$", name)) for name, found in windows.items())
+def test_promtool_takes_configuration_rules_and_metrics() -> None:
+    promtool("check", "config", str(DEPLOY / "prometheus/prometheus.yaml"))
+    promtool("check", "rules", "--lint-fatal", str(DEPLOY / "prometheus/alerts.yaml"))
+    assert promtool("check", "metrics", given=generate_latest(Metrics().registry)) == b""
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of Prometheus, is not here")
+@pytest.mark.nightly
 def test_alerts_come_and_stay_away() -> None:
-    tests = DEPLOY / "prometheus" / "alerts_test.yaml"
-    subprocess.run(["promtool", "test", "rules", str(tests)], check=True, timeout=60)
+    promtool("test", "rules", str(DEPLOY / "prometheus/alerts_test.yaml"))
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool, of Prometheus, is not here")
-def test_promtool_finds_no_fault_in_the_metrics() -> None:
-    done = subprocess.run(
-        ["promtool", "check", "metrics"], input=generate_latest(Metrics().registry), capture_output=True, timeout=60
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
-
-
-def test_every_alert_is_tried_out() -> None:
+def test_every_alert_is_tried_out_and_in_the_runbook() -> None:
+    names = {rule["alert"] for rule in ALERTS}
+    assert len(names) == len(ALERTS)
+    assert all(rule["labels"]["severity"] in ("page", "ticket") for rule in ALERTS)
+    assert all(rule["annotations"]["summary"] for rule in ALERTS)
+    runbook = (DEPLOY.parent / "docs/operation/alerts.md").read_text()
+    rows = "".join(re.findall(r"^\| `Mapless.*", runbook, re.MULTILINE))
+    assert set(re.findall(r"`(Mapless\w+)`", rows)) == names
     tests = yaml.safe_load((DEPLOY / "prometheus/alerts_test.yaml").read_text())["tests"]
     raised = {case["alertname"] for test in tests for case in test["alert_rule_test"] if case["exp_alerts"]}
     # Each is another one with other numbers.
-    assert {rule["alert"] for rule in ALERTS} - raised == {
-        "MaplessErrorsSlow",
-        "MaplessErrorsCreeping",
-        "MaplessCertificateEndsNow",
-    }
+    assert names - raised == {"MaplessErrorsSlow", "MaplessErrorsCreeping", "MaplessCertificateEndsNow"}
 
 
-# The dashboard
-
-
-def test_variables_are_defined_and_query_existing_series() -> None:
-    variables = {it["name"]: it for it in DASHBOARD["templating"]["list"]}
-    builtin = {"__rate_interval"}
-    used = set(re.findall(r"\$\{?(\w+)", json.dumps([DASHBOARD["panels"], DASHBOARD["annotations"]])))
-    assert used - builtin == set(variables)
-    for name in ("job", "instance"):
-        (metric,) = re.findall(r"label_values\((\w+)", variables[name]["query"])
-        assert metric in SERIES.by_name
+def test_recording_rules_measure_in_the_windows_of_their_names() -> None:
+    windows = {name: re.findall(r"\[(\w+)\]", expr) for name, expr in RECORDED.items()}
+    assert all(set(found) == set(re.findall(r"(?:ratio_rate|increase)(\w+)$", name)) for name, found in windows.items())
+    burning = [rule["expr"] for rule in ALERTS if rule["alert"].startswith("MaplessErrors")]
+    burning += [
+        target["expr"] for panel in PANELS if panel["title"].startswith("Burn rate") for target in panel["targets"]
+    ]
+    assert {number for expr in burning for number in re.findall(r"0\.\d+", expr)} == {"0.005"}  # one objective
 
 
 def test_grafana_is_given_what_the_dashboard_wants() -> None:
+    variables = {it["name"]: it for it in DASHBOARD["templating"]["list"]}
+    used = set(re.findall(r"\$\{?(\w+)", json.dumps([DASHBOARD["panels"], DASHBOARD["annotations"]])))
+    assert used - {"__rate_interval"} == set(variables)
+    for name in ("job", "instance"):
+        (metric,) = re.findall(r"label_values\((\w+)", variables[name]["query"])
+        assert metric in SERIES.by_name
     provisioning = DEPLOY / "grafana" / "provisioning"
     (source,) = yaml.safe_load((provisioning / "datasources/prometheus.yaml").read_text())["datasources"]
     (provider,) = yaml.safe_load((provisioning / "dashboards/mapless.yaml").read_text())["providers"]
-    compose = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
-    (variable,) = [it for it in DASHBOARD["templating"]["list"] if it["type"] == "datasource"]
-    assert variable["query"] == source["type"]
-    assert variable["current"]["value"] == source["uid"]
-    assert source["url"] == "http://prometheus:9090"
-    assert "127.0.0.1:9090:9090" in compose["prometheus"]["ports"]
-    assert f"./grafana/dashboards:{provider['options']['path']}:ro" in compose["grafana"]["volumes"]
-    home = Path(compose["grafana"]["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"])
-    assert (home.parent, (DEPLOY / "grafana/dashboards" / home.name).is_file()) == (
-        Path(provider["options"]["path"]),
-        True,
-    )
-
-
-# Prometheus
+    (variable,) = [it for it in variables.values() if it["type"] == "datasource"]
+    assert (variable["query"], variable["current"]["value"]) == (source["type"], source["uid"])
+    (port,) = re.findall(r"^http://prometheus:(\d+)$", source["url"])
+    assert f"127.0.0.1:{port}:{port}" in SERVICES["prometheus"]["ports"]
+    assert f"./grafana/dashboards:{provider['options']['path']}:ro" in SERVICES["grafana"]["volumes"]
+    home = Path(SERVICES["grafana"]["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"])
+    assert str(home.parent) == provider["options"]["path"]
+    assert (DEPLOY / "grafana/dashboards" / home.name).is_file()
+    assert source["jsonData"]["timeInterval"] == PROMETHEUS["global"]["scrape_interval"]
 
 
 def test_prometheus_asks_the_server_where_it_answers() -> None:
-    config = yaml.safe_load((DEPLOY / "prometheus/prometheus.yaml").read_text())
-    (job,) = config["scrape_configs"]
-    services = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
-    port = Settings.model_fields["metrics_port"].default
+    (job,) = PROMETHEUS["scrape_configs"]
     (asked,) = job["dns_sd_configs"]
-    assert set(asked["names"]) <= set(services)
-    assert (asked["type"], asked["port"]) == ("A", port)  # of a name with several containers, all are found
-    assert all((DEPLOY / "prometheus" / name).is_file() for name in config["rule_files"])
-    source = yaml.safe_load((DEPLOY / "grafana/provisioning/datasources/prometheus.yaml").read_text())["datasources"][0]
-    assert source["jsonData"]["timeInterval"] == config["global"]["scrape_interval"]
+    assert set(asked["names"]) <= set(SERVICES)
+    # Of a name with several containers, all are found.
+    assert (asked["type"], asked["port"]) == ("A", Settings.model_fields["metrics_port"].default)
+    (config,) = [it.partition("=")[2] for it in SERVICES["prometheus"]["command"] if it.startswith("--config.file=")]
+    assert f"./prometheus:{Path(config).parent}:ro" in SERVICES["prometheus"]["volumes"]
+    assert (DEPLOY / "prometheus" / Path(config).name).is_file()
 
 
 def test_the_adapter_asks_for_what_is_scaled_by() -> None:

@@ -14,7 +14,7 @@ from mapless_server.security import SceneKey, scene_id_of, tenant_of
 
 from . import codec, queries, rows
 from .database import is_damage, unless_damaged
-from .migrations import read_version
+from .migrations import OLDEST_VERSION, read_version
 from .queries import is_detached
 from .tables import features, global_descriptor, image, mask, reference, scene
 
@@ -61,14 +61,9 @@ def verify(connection: Connection, on_progress: Progress = ignore_progress) -> V
     version = read_version(connection)
     if version is None:
         raise ValueError("it is empty")
-    tables = [scene, reference, image, features]
-    checks = [_check_references, _check_features]
-    if version >= 2:
-        tables.append(global_descriptor)
-        checks += [_check_descriptors, _check_counts]
-    if version >= 3:
-        checks.append(_check_attributes)
-    if version >= 8:
+    tables = [scene, reference, image, features, global_descriptor]
+    checks = [_check_references, _check_features, _check_descriptors, _check_counts, _check_attributes]
+    if version > OLDEST_VERSION:
         tables.append(mask)
         checks.append(_check_masks)
     counts = {it.name: unless_damaged(connection, partial(_count, connection, it), lambda: 0) for it in tables}
