@@ -54,7 +54,7 @@ from mapless_server.store import Store
 from mapless_server.store.backup import back_up
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_tools.child import child_server
-from mapless_tools.replay.recompute import RecordedSource, followed
+from mapless_tools.replay.recompute import RecordedSource, StoredReferences, followed
 from mapless_tools.replay.report import Selection, select
 
 NIGHTLY = pytest.mark.nightly("replay")
@@ -223,29 +223,28 @@ def test_an_answer_that_was_another_is_shown(captured: Path, tmp_path: Path, mon
     assert (code, replayed["outcome_then"], replayed["outcome_now"]) == (1, "localized", "gate")
 
 
-@NIGHTLY
-def test_references_that_have_changed_since_are_named(captured: Path, tmp_path: Path) -> None:
+def test_references_that_have_changed_since_are_named(tmp_path: Path) -> None:
     """Others of the scene may change; and a scene that was deleted, or is in another store, is named, too."""
-    _, call = only(captured, tmp_path, is_named)
-    scene_key = key_of("default", "corner")
-    with Store.open(tmp_path / "data") as store:
-        store.delete_reference(scene_key, "r0")
-    assert replay(tmp_path)[0] == 0
-    with Store.open(tmp_path / "data") as store:
+    scene_key = key_of("acme", "hall")
+    with Store.open(tmp_path) as store:
+        store.create_scene(scene_key)
+        added = store.add_references(scene_key, [make_reference(f"r{i}") for i in range(4)])
+        keys = {it.reference_id: it.key for it in added[:3]}
+        parts = CapturedPart("a", 1, {"r0": keys["r0"]}), CapturedPart("b", 1, {it: keys[it] for it in ("r1", "r2")})
+        call = replace(a_call(), parts=parts)
+        references = StoredReferences(store, uses_depths=False)
         store.delete_reference(scene_key, "r3")
-        store.delete_reference(scene_key, "r5")
-        store.add_references(scene_key, [make_reference("r3")])
-    code, report = replay(tmp_path)
-    assert (code, report["calls"][0]["verdict"]) == (1, "not computed")
-    changed = "error: references of scene 'corner' have changed since: 'r3' was replaced, 'r5' was deleted"
-    assert report["calls"][0]["error"] == changed
-    with Store.open(tmp_path / "data") as store:
+        references.check(call)
+        store.delete_reference(scene_key, "r0")
+        store.delete_reference(scene_key, "r2")
+        store.add_references(scene_key, [make_reference("r0")])
+        changed = "references of scene 'hall' have changed since: 'r0' was replaced, 'r2' was deleted"
+        with pytest.raises(CaptureError, match=changed):
+            references.check(call)
         store.delete_scene(scene_key)
-    text = run("replay", tmp_path / "calls", "--data-dir", tmp_path / "data").output
-    assert (
-        f"{call.request_id} Localize default/corner: not computed, localized then; now error: scene 'corner' " in text
-    )
-    assert "was deleted since, or is in another store" in text
+        with pytest.raises(CaptureError, match="scene 'hall' was deleted since, or is in another store"):
+            references.check(call)
+        references.check(replace(call, parts=()))
 
 
 @NIGHTLY
@@ -259,6 +258,18 @@ def test_features_that_the_store_lacks_are_found_anew(captured: Path, tmp_path: 
     code, report = replay(tmp_path)
     assert (code, report["calls"][0]["verdict"]) == (0, "identical")
     assert path.read_bytes() == before
+
+
+@NIGHTLY
+def test_a_reference_that_is_damaged_since_is_named(captured: Path, tmp_path: Path) -> None:
+    _, call = only(captured, tmp_path, lambda it: it.method == "Localize" and bool(it.parts[0].choices))
+    reference_id, key = next(iter(call.parts[0].references.items()))
+    with closing(sqlite3.connect(tmp_path / "data" / DATABASE_FILE)) as connection, connection:
+        assert connection.execute("UPDATE features SET data = 'x' WHERE reference_key = ?", [key]).rowcount
+    (damaged,) = replay(tmp_path)[1]["calls"][0]["damaged"]
+    assert damaged.startswith(f"reference '{reference_id}' is damaged in the store (features)")
+    text = run("replay", tmp_path / "calls", "--data-dir", tmp_path / "data").output
+    assert f"    left out: {damaged}" in text
 
 
 @NIGHTLY

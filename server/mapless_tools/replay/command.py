@@ -97,6 +97,8 @@ def _print_call(call: Replayed) -> None:
         print(f"{head}: {call.verdict}, {call.outcome_then} then; now {call.error}")
         return
     print(f"{head}: {call.verdict}, {call.outcome_now}, {call.seconds_then:.2f} s then, {call.seconds_now:.2f} s now")
+    for damaged in call.damaged:
+        print(f"    left out: {damaged}")
     if call.verdict == "identical":
         return
     if call.apart_cm is not None and call.apart_deg is not None:

@@ -41,6 +41,8 @@ from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
 from mapless_server.scenes import Choice, Selection
 from mapless_server.scenes.library import Loaded, ReferenceLibrary
+from mapless_server.scenes.observer import BackgroundObserver
+from mapless_server.scenes.stored import DepthFinder
 from mapless_server.scheduling import Done, Flow, Job, Next
 from mapless_server.security import Principal, SceneKey, key_of
 from mapless_server.services.capture.calls import (
@@ -64,23 +66,30 @@ _CACHE_BYTES = 512 * 2**20
 
 
 class StoredReferences:
-    """References of captured calls in a store, which is only read: features that it lacks are kept in memory."""
+    """References of captured calls in a store, which is only read: features that it lacks are kept in memory.
 
-    def __init__(self, store: Store) -> None:
+    `damaged` has what is said of references of the call that was checked last.
+    """
+
+    def __init__(self, store: Store, uses_depths: bool) -> None:
+        self.damaged: list[str] = []
         self._store = store
         self._library = ReferenceLibrary(store)
+        self._depths = DepthFinder(store.database, BackgroundObserver()) if uses_depths else None
         self._described: LruCache[DescribedReference] = LruCache(_CACHE_BYTES)
 
     def check(self, call: CapturedCall) -> None:
         """Raises CaptureError, which names them, if references of a call were deleted or replaced since."""
-        keys = {name: key for part in call.parts for name, key in part.references.items()}
+        self.damaged = []
+        keys = dict.fromkeys(it for part in call.parts for it in part.references.items())
+        names = list(dict.fromkeys(name for name, _ in keys))
         try:
-            present = self._store.find_keys(key_of(call.tenant, call.scene_id), list(keys)) if keys else {}
+            present = self._store.find_keys(key_of(call.tenant, call.scene_id), names) if names else {}
         except NotFound as error:
             raise CaptureError(f"scene {call.scene_id!r} was deleted since, or is in another store") from error
         changed = [
             f"{name!r} was {'replaced' if name in present else 'deleted'}"
-            for name, key in keys.items()
+            for name, key in keys
             if present.get(name) != key
         ]
         if changed:
@@ -93,7 +102,8 @@ class StoredReferences:
         snapshot = self._store.load_references(scene_key, reference_ids, extractor.name)
         found = {it.record.reference_id: it for it in snapshot.references}
         found |= {it.reference_id: self._describe(it, extractor) for it in snapshot.undescribed}
-        return tuple(self._library.posed_view(found[it]) for it in reference_ids)
+        views = tuple(self._library.posed_view(found[it]) for it in reference_ids)
+        return views if self._depths is None else self._depths.with_depths(views, extractor.name)
 
     def _describe(self, record: ReferenceRecord, extractor: FeatureExtractor) -> DescribedReference:
         described = self._described.get((record.key, extractor.name))
@@ -166,7 +176,8 @@ class RecordedSource:
         return next((it for it in choices if is_own[it.descriptor] == wants_own), choices[0])
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
-        """Implements ReferenceSource: the reference was left out in the captured call, too."""
+        """Implements ReferenceSource: the reference is left out, as in a captured call if it was damaged then."""
+        self.references.damaged.append(str(error))
 
 
 MESSAGES: dict[str, tuple[Any, Any]] = {

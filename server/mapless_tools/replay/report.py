@@ -44,7 +44,7 @@ class Replayed:
 
     Outcomes are "localized" or the reason of the rejection, empty without an answer, for which `error` has the reason.
     Seconds are the computing time of all stages. Distances are None unless there are two poses, or if the answers are
-    identical.
+    identical. Damaged references are left out, and named with what is wrong.
     """
 
     request_id: str
@@ -63,6 +63,7 @@ class Replayed:
     apart_deg: float | None = None
     changes: tuple[Change, ...] = ()
     error: str = ""
+    damaged: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,8 +90,9 @@ def replay(folder: Path, selection: Selection, settings: Settings, backup: Path 
     paths = select(folder, selection, unreadable)
     calls, circumstances = [], dict[Change, None]()
     with ExitStack() as stack:
-        references = StoredReferences(stack.enter_context(_store(settings, backup)))
+        store = stack.enter_context(_store(settings, backup))
         tiers, options = _tiers(settings), engine_options(settings)
+        references = StoredReferences(store, any(tier.uses_depths for tier in tiers))
         for tier in tiers:
             stack.callback(tier.pipeline.matcher.close)
         now = circumstances_of(settings, tiers)
@@ -196,4 +198,5 @@ def _replayed(
         comparison.apart_cm,
         comparison.apart_deg,
         comparison.changes,
+        damaged=tuple(references.damaged),
     )
