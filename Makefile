@@ -15,7 +15,7 @@ PROTO_VENV  := $(VENV)/proto-tools
 # processes compiles all that it imports: a server takes 3.0 s of processor time to start instead of 1.3.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lock test nightly weights lint format proto released demo bench bench-turns bench-gpu load load-ray fuzz \
+.PHONY: help setup lock test nightly weights lint format proto released demo bench bench-turns bench-gpu evidence load load-ray fuzz \
     sbom release-images release-image reference docs clean
 
 help:  ## List the targets
@@ -97,6 +97,9 @@ bench-turns: setup  ## Compare what a query costs two commits, by turns in one r
 
 bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can measure
 	$(FROM_HERE) $(BIN)/python -m bench.network $(ARGS)
+
+evidence: setup  ## Measure a constant again and write its page; KEY=..., without it the keys; DATA=folder with the scenes
+	$(FROM_HERE) $(BIN)/python -m research.evidence $(KEY) $(if $(DATA),'$(DATA)') $(ARGS)
 
 load: setup  ## Measure the server under load; DATA=folder for real photographs, ARGS="--minutes 2" for all's options
 	$(FROM_HERE) $(BIN)/python -m bench.load all $(if $(DATA),--data '$(DATA)') $(ARGS)

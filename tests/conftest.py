@@ -24,14 +24,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if tenth is None:
         return
     # By name, so that a new test moves no other to another day.
-    others = {unit for unit in map(_unit, items) if zlib.crc32(unit.encode()) % 10 != tenth}
+    others = {unit for unit in map(_unit, items) if unit and zlib.crc32(unit.encode()) % 10 != tenth}
     config.hook.pytest_deselected(items=[item for item in items if _unit(item) in others])
     items[:] = [item for item in items if _unit(item) not in others]
 
 
 def _unit(item: pytest.Item) -> str:
-    """What a nightly test runs with: those whose marker has one name, which share a costly set-up; else itself."""
+    """What a nightly test runs with: those whose marker has one name, which share a costly set-up; else itself.
+
+    Those of `every_tenth` run with each.
+    """
     marker = item.get_closest_marker("nightly")
-    if marker is None:
+    if marker is None or marker.kwargs.get("every_tenth"):
         return ""
     return str(marker.args[0]) if marker.args else item.nodeid

@@ -1,18 +1,28 @@
-"""Pages of evidence name constants, `module:NAME` = `value`, with the values that the code has."""
+"""Constants of the code name pages of evidence, and these name the constants, with the values that the code has."""
 
 import importlib
+import operator
 import re
+from datetime import date
+from functools import cache
 from pathlib import Path
 
 import pytest
 
-from research.evidence.page import PAGES
+from research.evidence.__main__ import DATA, KEYS, main, measurement_of
+from research.evidence.page import PAGES, rewritten
 
-STATED = re.compile(r"`([\w.]+):([\w.]+)` = `([^`]+)`")
-
-
+CODE = PAGES.parents[1] / "server"
+STATED = re.compile(r"^`([\w.]+):([\w.]+)` = `([^`]+)`$", re.MULTILINE)
+NAMED = re.compile(r"Evidence: ([a-z][\w-]*(?:, [a-z][\w-]*)*)\.")
 INDEX = PAGES / "index.md"
 EVIDENCE = sorted({*PAGES.glob("*.md")} - {INDEX})
+
+
+@cache
+def keys_of(module: Path) -> set[str]:
+    """The keys that a module's docstrings name."""
+    return {key for found in NAMED.findall(re.sub(r"\s+", " ", module.read_text())) for key in found.split(", ")}
 
 
 def test_the_index_and_the_site_have_every_page() -> None:
@@ -22,15 +32,117 @@ def test_the_index_and_the_site_have_every_page() -> None:
     assert sorted(re.findall(r": evidence/([\w-]+\.md)", site)) == names
 
 
+def test_every_key_in_the_code_has_a_page() -> None:
+    named = {key for path in (CODE / "mapless_server").rglob("*.py") for key in keys_of(path)}
+    assert not named - {path.stem for path in EVIDENCE}
+
+
 @pytest.mark.parametrize("path", EVIDENCE, ids=lambda it: it.stem)
 def test_a_page_states_the_values_that_the_code_has(path: Path) -> None:
     text = path.read_text()
     stated = STATED.findall(text)
-    assert stated
+    assert text.splitlines()[2].startswith(f"`{stated[0][0]}:")
     for module, name, value in stated:
         found = importlib.import_module(module)
-        for part in name.split("."):
-            found = getattr(found, part)
-        assert repr(found) == value
-    assert "**Question.**" in text
-    assert "**Data.**" in text
+        assert found.__file__ is not None
+        assert path.stem in keys_of(Path(found.__file__)), f"{module} does not name the page"
+        assert repr(operator.attrgetter(name)(found)) == value
+    parts = ("**Question.**", "**Data.**", "**Command.**", "**Decision.**")
+    assert [text.count(it) for it in parts] == [1, 1, 1, 1]
+
+
+def test_every_page_is_measured_by_a_program_or_says_it_is_not() -> None:
+    measured = set()
+    for path in EVIDENCE:
+        (command,) = re.findall(r"^\*\*Command\.\*\* (.*(?:\n.+)*)", path.read_text(), re.MULTILINE)
+        if re.match(rf"`make evidence KEY={path.stem}(?: DATA=\S+)?`, \d{{4}}-\d\d-\d\d, [0-9a-f]{{8}}", command):
+            measured.add(path.stem)
+        else:
+            assert re.match(r"none: measured at [0-9a-f]{8}|`[^`]*python -m bench[\w.]* ", command), path.name
+    assert measured == set(KEYS)
+    assert all(measurement_of(key).rows for key in KEYS)
+
+
+@cache
+def constant(key: str) -> object:
+    """The first constant of a page."""
+    module, name, _ = STATED.findall((PAGES / f"{key}.md").read_text())[0]
+    return operator.attrgetter(name)(importlib.import_module(module))
+
+
+@pytest.mark.nightly(every_tenth=True)
+@pytest.mark.timeout(900)
+def test_a_key_measured_again_decides_for_the_value_in_use(request: pytest.FixtureRequest) -> None:
+    """One of those that take at most a minute, by the day or by --tenth."""
+    quick = [key for key in KEYS if measurement_of(key).decide is not None]
+    tenth = request.config.getoption("--tenth")
+    key = quick[(date.today().toordinal() if tenth is None else tenth) % len(quick)]
+    measurement = measurement_of(key)
+    if measurement.needs_scenes and next(DATA.glob("*/cameras.json"), None) is None:
+        pytest.skip(f"needs real photographs, {DATA} is absent")
+    assert measurement.decide is not None
+    rows = list(measurement.rows(DATA))
+    assert measurement.decide(rows) == constant(key), f"{key}: {rows}"
+
+
+PAGE = """# k
+
+`m:N` = `1`
+
+**Question.** What?
+
+**Command.** `old`,
+of yesterday.
+
+| a |
+| --- |
+| 1 |
+
+**Decision.** 1.
+"""
+
+
+def test_a_page_keeps_its_text_and_gets_a_new_table() -> None:
+    text = rewritten(PAGE, "k", [{"b": 2}, {"b": 3}])
+    assert text.replace(re.findall(r"\*\*Command.*", text)[0], "") == PAGE.replace(
+        "**Command.** `old`,\nof yesterday.", ""
+    ).replace("| a |\n| --- |\n| 1 |", "| b |\n| --- |\n| 2 |\n| 3 |")
+    assert rewritten(text, "k", [{"b": 2}, {"b": 3}]) == text
+    with pytest.raises(ValueError, match="no line"):
+        rewritten("# k", "k", [{"b": 2}])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["no-such-key"], "invalid choice"),
+        (["accusation-chance", "--nothing"], "unrecognized arguments"),
+        (["accusation-chance", "EMPTY"], "has no scenes"),
+        (["accusation-chance", "EMPTY/absent"], "has no scenes"),
+        (["same-place", "OTHER"], "cannot be read"),
+        (["stationary-support", "OTHER"], "kitti-drive-a"),
+    ],
+)
+def test_wrong_usage_ends_with_2_and_leaves_the_page(
+    arguments: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "other/place").mkdir(parents=True)
+    (tmp_path / "other/place/cameras.json").write_text('{"frames": [], "metric": true}')
+    (tmp_path / "empty").mkdir()
+    pages = tmp_path / "pages"
+    pages.mkdir()
+    for key in KEYS:
+        (pages / f"{key}.md").write_text(PAGE)
+    monkeypatch.setattr("research.evidence.__main__.PAGES", pages)
+    folders = {"EMPTY": str(tmp_path / "empty"), "OTHER": str(tmp_path / "other")}
+    given = [re.sub("EMPTY|OTHER", lambda it: folders[it.group()], it) for it in arguments]
+    monkeypatch.setattr("sys.argv", ["evidence", *given])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+    assert {it.read_text() for it in pages.iterdir()} == {PAGE}

@@ -19,7 +19,7 @@ RESERVED_SHARE, MOST_RESERVED = 0.25, 512
 FEW_CONNECTIONS = 4096
 """A server with fewer connections is said to have too few: strangers that open them can keep others out."""
 HANDSHAKE_S, SHORT_HANDSHAKE_S = 10.0, 3.0
-"""Time for TLS and the preface of HTTP/2; the short one where there are few connections."""
+"""Time for TLS and the preface of HTTP/2; the short one where there are few connections. Evidence: handshake."""
 CHECK_INTERVAL_S = 5.0
 FULL_SHARE = 0.8
 """Share of the allowed connections from which on the log warns."""

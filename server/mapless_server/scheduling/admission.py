@@ -43,7 +43,8 @@ class WorkQueueOptions:
 
 
 CLIENT_SHARE = 0.75
-"""Share that one client may book of its caller's room, so that there is room for other clients."""
+"""Share that one client may book of its caller's room, so that there is room for other clients.
+Evidence: queue-client-share."""
 MEMORY_SHARE = CLIENT_SHARE**0.5
 """Share that one caller may hold of the memory that others leave, and a client of its caller's part."""
 TIME_MARGIN = 1.2

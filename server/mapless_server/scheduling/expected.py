@@ -7,9 +7,11 @@ from .jobs import Flow
 from .shares import Shares
 
 LATELY_S = 1.0
-"""While others that have been given less have asked within this time, a caller's long steps leave them one thread."""
+"""While others that have been given less have asked within this time, a caller's long steps leave them one thread.
+Evidence: queue-lately."""
 SHORTER = 1.25
-"""So many times less such a job must take: of callers whose steps take about as long, none leaves a thread idle."""
+"""So many times less such a job must take: of callers whose steps take about as long, none leaves a thread idle.
+Evidence: queue-shorter."""
 MUCH_SHORTER = 4
 """A job that takes so many times less than the steps of others does not wait for them, if a lane has two threads."""
 

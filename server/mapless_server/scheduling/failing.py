@@ -9,7 +9,7 @@ from .expected import LATELY_S
 from .jobs import Flow
 
 MEMORY = 4
-"""So many of a caller's last photographs count."""
+"""So many of a caller's last photographs count. Evidence: queue-failing."""
 FAILURES = 2
 """The ladder of a caller is cut if so many of its last photographs failed, one after the other."""
 FORGOTTEN_S = 60.0

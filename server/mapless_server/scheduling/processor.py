@@ -7,7 +7,7 @@ import time
 from contextlib import suppress
 
 NICENESS = 10
-"""Niceness of threads of low priority, above the process's own.
+"""Niceness of threads of low priority, above the process's own. Evidence: lost-robots.
 
 Linux gives such a thread a tenth of a core that another one of the process wants, and all of one that no other wants.
 """

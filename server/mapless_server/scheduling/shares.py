@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from .jobs import Flow
 
 CREDIT_S = 10.0
-"""Computing time by which a member that has used less than others may be preferred, when it comes again."""
+"""Computing time by which a member that has used less than others may be preferred, when it comes again. Evidence:
+queue-credit."""
 Turn = tuple[float | int, ...]
 """Sorts clients in the order in which they are served."""
 MAX_IDLE = 100

@@ -1,4 +1,4 @@
-"""Asks the cases, compares two files of answers, or sums up what rungs earned; see the package."""
+"""Asks the cases, or compares two files of answers; see the package."""
 
 import argparse
 import json
@@ -13,7 +13,6 @@ from .asking import Row, ask_all
 from .cases import KINDS, Case
 from .comparing import report, table
 from .places import place_reader
-from .rungs import answers_of, rungs
 
 
 def main() -> None:
@@ -23,7 +22,6 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the answers")
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS), help="kinds of cases; default: all")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="every N-th case of each kind; default: all")
-    parser.add_argument("--rungs", type=Path, nargs="+", metavar="FILE", help="print what each rung earned")
     parser.add_argument("--compare", type=Path, nargs=2, metavar=("BEFORE", "AFTER"), help="two files of answers")
     arguments = parser.parse_args()
     try:
@@ -31,11 +29,8 @@ def main() -> None:
             before, after = (json.loads(it.read_text())["answers"] for it in arguments.compare)
             print("\n".join(report(before, after)))
             return
-        if arguments.rungs:
-            print("\n".join(rungs(it for file in arguments.rungs for it in answers_of(file))))
-            return
         if arguments.scenes is None or arguments.json is None:
-            parser.error("give SCENES and --json, or --compare, or --rungs")
+            parser.error("give SCENES and --json, or --compare")
         if arguments.every < 1:
             parser.error(f"--every must be at least 1, is {arguments.every}")
         check_writable(arguments.json)

@@ -1,13 +1,11 @@
-"""Measures a constant again and writes its page: `PYTHONPATH=client:server python -m research.evidence KEY [SCENES]`.
+"""Measures a constant again and writes the table of its page: `make evidence KEY=KEY DATA=SCENES`."""
 
-SCENES is the folder of the scenes' folders, by default ../shared/data. Without a KEY it lists them.
-"""
-
+import argparse
 import importlib
 import sys
 from pathlib import Path
 
-from .page import PAGES, page
+from .page import PAGES, Measurement, rewritten
 
 MODULES = {
     "stationary": (
@@ -24,28 +22,56 @@ MODULES = {
     "accused": ("accusation-chance",),
     "worth": ("rungs-worth", "place-agreement"),
     "any_roll": ("any-roll-pixels",),
+    "mask_margin": ("mask-margin",),
+    "scene_agreement": ("scene-agreement",),
+    "rungs": ("rungs",),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }
-"""The keys that each module measures, by `measure(key, scenes)`, which returns the question and its rows."""
+"""The keys of each module, by its MEASUREMENTS; a module is imported when one of them is measured."""
+KEYS = tuple(key for keys in MODULES.values() for key in keys)
+DATA = Path(__file__).parents[3].parent / "shared" / "data"
 
 
-def main(arguments: list[str]) -> None:
-    """Writes the page of the key in the arguments, or prints the keys."""
-    module_of = {key: module for module, keys in MODULES.items() for key in keys}
-    if not arguments or arguments[0] not in module_of:
-        print("\n".join(module_of))
-        sys.exit(0 if not arguments else 2)
-    key, scenes = arguments[0], Path(arguments[1] if len(arguments) > 1 else "../shared/data")
-    measured = importlib.import_module(f".{module_of[key]}", __package__)
-    PAGES.mkdir(exist_ok=True)
-    question, rows = measured.measure(key, scenes)
-    value, done = question.value, []  # rows may set the constant
-    for row in rows:
-        print(*row.values(), sep=" | ", flush=True)
-        done.append(row)
-        # After each row: what is measured in many minutes may be stopped.
-        (PAGES / f"{key}.md").write_text(page(question, value, done))
+def measurement_of(key: str) -> Measurement:
+    """How a key is measured."""
+    (module,) = (module for module, keys in MODULES.items() if key in keys)
+    found: Measurement = importlib.import_module(f"research.evidence.{module}").MEASUREMENTS[key]
+    return found
+
+
+def main() -> None:
+    """Measures a key, or prints the keys; wrong usage, and a folder that lacks scenes, end with exit code 2."""
+    parser = argparse.ArgumentParser(prog="python -m research.evidence", description=__doc__)
+    parser.add_argument("key", nargs="?", choices=KEYS, metavar="KEY", help="without one, the keys are printed")
+    parser.add_argument("scenes", nargs="?", type=Path, default=DATA, help="folder of the scenes' folders")
+    parser.add_argument("--print", action="store_true", help="print the table and leave the page as it is")
+    arguments = parser.parse_args()
+    if arguments.key is None:
+        print("\n".join(KEYS))
+        return
+    key, scenes = arguments.key, arguments.scenes
+    measurement, page = measurement_of(key), PAGES / f"{key}.md"
+    if not page.is_file():
+        parser.error(f"write the question, data and decision first: {page} does not exist")
+    if measurement.needs_scenes and next(scenes.glob("**/cameras.json"), None) is None:
+        parser.error(f"{scenes} has no scenes, folders with images/ and cameras.json")
+    rows = []
+    try:
+        for row in measurement.rows(scenes):
+            print(*row.values(), sep=" | ", flush=True)
+            rows.append(row)
+        if not rows:
+            parser.error(f"{scenes} has none of the scenes that {key} is measured with")
+        is_usual = not measurement.needs_scenes or scenes.resolve() == DATA.resolve()
+        # Only now: a page never has a part of its table.
+        text = rewritten(page.read_text(), key, rows, "" if is_usual else scenes.resolve().name)
+    except (OSError, ValueError) as error:
+        parser.error(str(error))
+    if measurement.decide is not None:
+        print(f"decides for {measurement.decide(rows)}")
+    if not arguments.print:
+        page.write_text(text)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    sys.exit(main())

@@ -35,7 +35,7 @@ from mapless_tools.evaluate.plan import evenly_spread
 from mapless_tools.evaluate.references import choose_references
 from mapless_tools.ingest.formats.cameras import read_folder
 
-from .page import Question, Row
+from .page import Measurement, Row
 
 SPARSE, KS, WINDOW = 10, (3, 5, 10), 40
 """References of a sparse scene; how many are used; frames around the query that are looked through in a dense one."""
@@ -179,23 +179,6 @@ def asked_of(scenes: Scenes, each: int, planted: Sequence[str]) -> Iterator[Aske
 
 
 BOUNDS = (-1.0, -2.0, -3.0, -3.5, -4.0, -4.5, -5.0, -6.0, -8.0, -10.0)
-QUESTION = Question(
-    "accusation-chance",
-    "mapless_server.method.bundle.significance:MAX_LOG10_CHANCE",
-    "How small must the chance be that right intrinsics seem as wrong as a check finds them, for these to be accused? "
-    "It is log10 of the expected number of accusations by the check, of all alternatives that it tests.",
-    "All scenes of the folder, SIFT, in process: photographs evenly spread, each with the 3, 5 and 10 references that "
-    "share most with it, of the frames around it (dense) and of ten frames of its scene (sparse). Each is asked with "
-    "its own intrinsics, or with one planted error: focal length times 0.75, 0.87, 1.15, 1.3; k1 off by 0.2 and -0.2; "
-    "sides exchanged; intrinsics of half and of 1.5 times the size; principal point off by 10 % of the width.",
-    "-4: the loosest bound at which no photograph is accused whose intrinsics are right, and one at which as many "
-    "planted errors are named as by the rules before.",
-)
-
-
-def measure(key: str, scenes: Path) -> tuple[Question, Iterator[Row]]:
-    """The question and a row for each bound."""
-    return QUESTION, _rows(scenes)
 
 
 def _rows(folder: Path) -> Iterator[Row]:
@@ -211,3 +194,6 @@ def _rows(folder: Path) -> Iterator[Row]:
             f"of {len(right)} right: accused": sum(it <= bound for it in right),
             f"of {len(planted)} planted: named": sum(it <= bound for it in planted),
         }
+
+
+MEASUREMENTS = {"accusation-chance": Measurement(_rows)}

@@ -22,19 +22,8 @@ from research.contradictions.places import Place, place_reader
 from research.doubt.scenes import FOLDERS, PLACES
 from research.doubt.turning import turned, turned_image
 
-from .page import Question, Row
+from .page import Measurement, Row
 
-QUESTION = Question(
-    "any-roll-pixels",
-    "mapless_server.serve.assembly:ANY_ROLL_PIXELS",
-    "In how many pixels of a photograph must SIFT be found, which follows other features?",
-    "two photographs of each folder of shared/data, turned by 45 degrees, and one of another place, with 5 references "
-    "that are evenly spread and have SIFT of the whole photograph. Two references agree if the photograph's matches "
-    f"with both have an agreement of {PROMISE.agreement:g} (see place-agreement).",
-    "All photographs but one that have two references that agree with all pixels, for less than half of the time. The "
-    "references were given, not chosen by the smaller raster; how accurate the poses are is not part of it: on "
-    "`chess-king`, where references are chosen, all 14 photographs are localized, with a median error of 0.1 %.",
-)
 PIXELS = (320 * 240, 480 * 360, 640 * 480, 960 * 720, None)
 ANGLE_DEG = 45
 QUERIES, FEW = 2, 5
@@ -49,11 +38,6 @@ class Found:
     max_pixels: int | None
     agreement: float
     seconds: float
-
-
-def measure(key: str, scenes: Path) -> tuple[Question, Iterator[Row]]:
-    """The question, and the rows of its table."""
-    return QUESTION, iter(rows(list(_all_found(scenes))))
 
 
 def rows(found: Sequence[Found]) -> Iterator[Row]:
@@ -102,3 +86,6 @@ def _found(place: Place, asked: Sequence[tuple[Frame, bool]]) -> Iterator[Found]
             agreement = sorted(it.agreement if it else 0.0 for it in shown)[-2]
             yield Found(is_own, max_pixels, agreement, seconds)
     matcher.close()
+
+
+MEASUREMENTS = {"any-roll-pixels": Measurement(lambda scenes: rows(list(_all_found(scenes))))}

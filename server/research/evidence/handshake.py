@@ -16,29 +16,13 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 from cryptography.x509.oid import NameOID
 
-from .page import Question, Row
+from .page import Measurement, Row
 
 LIMITS_S = (1.0, 3.0, 10.0, 30.0)
 ROUND_TRIPS_S = (0.1, 0.6, 1.5, 4.0)
 """A mobile link; a geostationary satellite; a link that queues for a second; one that loses packets, too."""
 AT_ONCE = 400
 _GIVEN_UP_S = 40.0
-
-QUESTION = Question(
-    "handshake",
-    "mapless_server.rpc.descriptors:HANDSHAKE_S",
-    "How long may a connection take for TLS and the preface of HTTP/2? What takes longer is ended, and a stranger that "
-    "sends nothing holds a file descriptor so long. `SHORT_HANDSHAKE_S`, 3 s, is that where there are few descriptors.",
-    "A gRPC server with TLS (P-256) on loopback, and a gRPC client that reaches it through a relay, which delays "
-    "each packet by half of the round trip, two of which it takes. Ready: the "
-    f"first connection becomes ready, with its time. {AT_ONCE} clients that shake hands at once, as after a restart, "
-    "are Python's on the same machine, whose processors they take, too. Strangers: connections in a second that hold "
-    "all of 768 (a limit of 1024 descriptors).",
-    "10 s, and 3 s where descriptors are few. Three seconds are enough for a satellite, and just so for a link that "
-    "queues for a second; ten for one that also loses a packet or two, whose repetitions take 1 and 2 s. One second "
-    "is too little for a fleet that returns at once. More than ten helps only links on which a call of 30 s is late "
-    "anyway, and lets strangers hold more. A client that is too slow is not lost: it tries again until its deadline.",
-)
 
 
 @dataclass(frozen=True)
@@ -142,6 +126,4 @@ def _rows() -> Iterator[Row]:
         yield row | {"strangers in a second": f"{768 / limit_s:.0f}"}
 
 
-def measure(key: str, scenes: object) -> tuple[Question, Iterator[Row]]:
-    """The question, and its rows as they are measured; no photographs are needed."""
-    return QUESTION, _rows()
+MEASUREMENTS = {"handshake": Measurement(lambda scenes: _rows(), needs_scenes=False)}

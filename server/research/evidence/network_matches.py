@@ -20,32 +20,8 @@ from mapless_tools.evaluate.plan import evenly_spread
 from research.contradictions.places import Place, place_reader
 from research.doubt.scenes import FOLDERS, PLACES
 
-from .page import Question, Row
+from .page import Measurement, Row
 
-DATA = (
-    "two photographs of each folder of shared/data and one of another place, matched by ALIKED and LightGlue with the "
-    "two of 5 references (kitchen 3, lockers 12, statue 20), evenly spread, that have the most matches by nearest "
-    "neighbours. A match is right within 4 pixels of its epipolar line by the known poses."
-)
-QUESTIONS = {
-    "rematched-keypoints": Question(
-        "rematched-keypoints",
-        "mapless_server.method.features.matching:CorrespondOptions.rematched_keypoints",
-        "How many keypoints of a photograph and of a reference must LightGlue match on a CPU?",
-        DATA,
-        "A half of the keypoints takes a third of the time, and has half of the right matches: enough for all but one "
-        "of these photographs, as a quarter has; of the doubtful ones (`research.doubt`) that only LightGlue gets "
-        "right, all are right with 512, too. Fewer were not tried on these.",
-    ),
-    "promising-matches": Question(
-        "promising-matches",
-        "mapless_server.method.features.matching:CorrespondOptions.promising_matches",
-        "How many matches must one of the two best references have for the others to be matched, too?",
-        DATA,
-        "Three of 22 photographs of other places have so many; those of the place have at least 108 where matches are "
-        "right. Hard ones have fewer, so 30 was chosen rather than 40, which no other place reaches.",
-    ),
-}
 KEYPOINTS = (256, 512, 1024)
 THRESHOLDS = (10, 15, 20, 30, 40)
 COUNTS = {"7scenes-redkitchen-seq01-first600": 3, "office-lockers": 12, "statue-of-liberty-internet": 20}
@@ -65,12 +41,6 @@ class Found:
     most: int
     most_right: int
     seconds: float
-
-
-def measure(key: str, scenes: Path) -> tuple[Question, Iterator[Row]]:
-    """The question of a key, and the rows of its table."""
-    found = list(_all_found(scenes))
-    return QUESTIONS[key], iter(by_keypoints(found) if key == "rematched-keypoints" else by_threshold(found))
 
 
 def by_keypoints(found: Sequence[Found]) -> Iterator[Row]:
@@ -137,3 +107,9 @@ def _found(query: PosedView, references: Sequence[PosedView], matcher: Matcher, 
             for it, found in zip(best, matches, strict=True)
         ]
         yield Found(is_own, keypoints, max(map(len, matches)), max(rights), seconds)
+
+
+MEASUREMENTS = {
+    "rematched-keypoints": Measurement(lambda scenes: by_keypoints(list(_all_found(scenes)))),
+    "promising-matches": Measurement(lambda scenes: by_threshold(list(_all_found(scenes)))),
+}

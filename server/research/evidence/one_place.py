@@ -6,7 +6,7 @@ The attempts of each photograph are computed once, with SIFT; each alternative d
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from mapless.geometry import Camera
@@ -33,43 +33,11 @@ from research.contradictions.asking import is_near
 from research.contradictions.cases import KINDS, Case, Expected
 from research.contradictions.places import Place, place_reader
 
-from .page import Question, Row
+from .page import Measurement, Row
 from .places import distance_seen
 
 ASKED = ("sparse", "repeated", "two-places", "right-priors", "wrong-priors")
 REFERENCES = 10
-CODE = "mapless_server.method.judge.decide:PlaceOptions"
-DATA = (
-    "The cases of `research.contradictions` of the kinds "
-    + ", ".join(ASKED)
-    + " (250 photographs of kitchen, lockers, "
-    "meeting room, statue, can, chess king, fountain and box), SIFT, the ten references with the most matches, all "
-    "attempts that the ladder makes with the value in use."
-)
-QUESTIONS = {
-    it.key: it
-    for it in (
-        Question(
-            "same-place",
-            f"{CODE}.same_position_m",
-            "How far apart may two poses of one photograph be that count as one place? The other two bounds, 2 degrees "
-            "and 5 % of the distance to what the photograph shows, are scaled with it.",
-            DATA,
-            "The values of the rules before this one. With SIFT alone these data do not decide, since few photographs "
-            "have poses of two places. Measured before, not in this table: with EdgePoint2 and ALIKED, on 289 "
-            "photographs, the rule with them "
-            "localized 186, 5 of them wrongly, where the former rules had 184 and 6.",
-        ),
-        Question(
-            "clearly-more",
-            f"{CODE}.clearly_more",
-            "By which factor must the score of a place exceed that of any other to be answered?",
-            DATA,
-            "1.5, as the rules before this one. From 1.25 to 5 no photograph is answered otherwise, "
-            "and at 1 to 1.1 one more rightly: these data do not decide.",
-        ),
-    )
-}
 ALTERNATIVES = {
     "same-place": {
         f"{scale * 0.1:g} m, {scale * 2:g} deg, {scale * 5:g} %": PlaceOptions(0.1 * scale, 2 * scale, 0.05 * scale)
@@ -88,11 +56,6 @@ class Asked:
     case: Case
     found: Sequence[Found]
     priors: Priors
-
-
-def measure(key: str, scenes: Path) -> tuple[Question, Iterator[Row]]:
-    """The question and a row for each alternative."""
-    return QUESTIONS[key], _rows(key, scenes)
 
 
 def _rows(key: str, scenes: Path) -> Iterator[Row]:
@@ -177,3 +140,6 @@ def _method_priors(case: Case) -> Priors:
     request = pb.LocalizeRequest()
     set_priors(request, case.priors)
     return priors_from_message(request, SceneAttributes())[1]
+
+
+MEASUREMENTS = {key: Measurement(partial(_rows, key)) for key in ALTERNATIVES}

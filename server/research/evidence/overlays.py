@@ -24,7 +24,7 @@ def badge(image: Image, number: int) -> tuple[Image, Mask]:
     h, w = image.shape[:2]
     mask = np.zeros((h, w), bool)
     mask[: round(0.16 * h), : round(0.22 * w)] = True
-    return _pasted(image, _clutter(image.shape, 1), mask), mask
+    return _pasted(image, clutter(image.shape, 1), mask), mask
 
 
 def bonnet(image: Image, number: int) -> tuple[Image, Mask]:
@@ -32,7 +32,7 @@ def bonnet(image: Image, number: int) -> tuple[Image, Mask]:
     h, w = image.shape[:2]
     mask = np.zeros((h, w), np.uint8)
     cv2.ellipse(mask, (w // 2, h), (round(0.45 * w), round(0.18 * h)), 0, 180, 360, 1, -1)
-    return _pasted(image, _clutter(image.shape, 2), mask > 0), mask > 0
+    return _pasted(image, clutter(image.shape, 2), mask > 0), mask > 0
 
 
 def gripper(image: Image, number: int) -> tuple[Image, Mask]:
@@ -47,7 +47,7 @@ def gripper(image: Image, number: int) -> tuple[Image, Mask]:
             (0.5 + side * 0.30, 1),
         ]
         cv2.fillPoly(mask, [np.array([(x * w, y * h) for x, y in outline], np.int32)], 1)
-    return _pasted(image, _clutter(image.shape, 3), mask > 0), mask > 0
+    return _pasted(image, clutter(image.shape, 3), mask > 0), mask > 0
 
 
 def time_stamp(image: Image, number: int) -> tuple[Image, Mask]:
@@ -129,7 +129,7 @@ def _pasted(image: Image, other: Image, mask: Mask) -> Image:
     return pasted
 
 
-def _clutter(shape: tuple[int, ...], seed: int) -> Image:
+def clutter(shape: tuple[int, ...], seed: int) -> Image:
     """A picture full of corners."""
     random, (h, w) = np.random.default_rng(seed), shape[:2]
     picture = np.full(shape, 90, np.uint8)

@@ -1,8 +1,9 @@
 """Overlays that are fixed to the camera: photographs of other places with the same one, and of the place itself."""
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -29,8 +30,7 @@ from mapless_tools.evaluate.references import choose_references
 from mapless_tools.ingest.formats.cameras import read_folder
 
 from .overlays import OVERLAYS, Image, Mask, Overlay, black, nothing
-from .page import Question, Row
-from .stationary_questions import QUESTIONS
+from .page import Measurement, Row, least
 
 ROOM = Path(__file__).parents[2] / "mapless_tools" / "demo" / "room"
 KITCHEN, DRIVE = "7scenes-redkitchen-seq01-first600", "kitti-drive-a"
@@ -160,16 +160,21 @@ def with_overlay(
 ) -> View:
     """The view of a photograph with an overlay; without the keypoints on it if `masked`."""
     drawn, mask = overlay(image, number)
-    encoded = cv2.imencode(".jpg", drawn[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
-    decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR_RGB)
-    assert decoded is not None
-    view = extractor.extract(np.asarray(decoded, np.uint8), camera)
+    view = extractor.extract(encoded(drawn), camera)
     if not masked:
         return view
     kept, features = ~on_mask(view, mask), view.features
     return replace(
         view, features=Features(features.keypoints[kept], features.descriptors[kept], features.sizes_px[kept])
     )
+
+
+def encoded(image: Image) -> Image:
+    """The image as JPEG has it."""
+    jpeg = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])[1]
+    decoded = cv2.imdecode(jpeg, cv2.IMREAD_COLOR_RGB)
+    assert decoded is not None
+    return np.asarray(decoded, np.uint8)
 
 
 def on_mask(view: View, mask: Mask) -> NDArray[np.bool_]:
@@ -247,22 +252,7 @@ def clean(folder: Path, name: str, extractor: FeatureExtractor) -> list[PosedVie
     return found
 
 
-_ALTERNATIVES = {
-    "stationary-contradicted-px": [
-        replace(StationaryOptions(), contradicted_px=value) for value in (1.0, 2.0, 3.0, 4.0, 6.0, 8.0)
-    ],
-    "stationary-support": [replace(StationaryOptions(), support=value) for value in (1, 2, 3, 5, 10)],
-}
-
-
-def measure(key: str, folder: Path) -> tuple[Question, Iterable[Row]]:
-    """Measures one of `QUESTIONS` with the scenes of a folder, row by row."""
-    rows = {
-        "stationary-overlays": _overlays,
-        "stationary-unmoved-px": _unmoved,
-        "stationary-same-view-share": _same_view,
-    }
-    return QUESTIONS[key], rows[key](folder) if key in rows else _alternatives(folder, key)
+_ALTERNATIVES = {"contradicted_px": (1.0, 2.0, 3.0, 4.0, 6.0, 8.0), "support": (1, 2, 3, 5, 10)}
 
 
 def _extractors() -> dict[str, FeatureExtractor]:
@@ -282,15 +272,19 @@ def _overlays(folder: Path) -> Iterator[Row]:
     extractors = _extractors()
     for scene in scenes_in(folder):
         for features, extractor in extractors.items():
-            for name, overlay in OVERLAYS.items():
-                found = compared(draw(scene, overlay, extractor), features)
-                yield {"features": features, "scene": scene.name, "overlay": name, **found}
+            found = [compared(draw(scene, it, extractor), features) for it in OVERLAYS.values()]
+            sums = {title: [flag for it in found for flag in it[title]] for title in found[0]}
+            yield {
+                "features": features,
+                "scene": scene.name,
+                **{title: f"{sum(some)} of {len(some)}" for title, some in sums.items()},
+            }
 
 
-def compared(drawn: Drawn, features: str) -> Row:
-    """Figures of one scene with one overlay."""
+def compared(drawn: Drawn, features: str) -> dict[str, list[bool]]:
+    """One scene with one overlay: for each photograph whether it holds, by the titles of the page's columns."""
     checked = pipeline_of(features, StationaryOptions())
-    found = {
+    return {
         "other places localized": accepted(drawn.others, drawn.references, checked),
         "the same, nothing ignored": accepted(drawn.others[:UNCHECKED], drawn.references, pipeline_of(features, OFF)),
         "right": right(drawn.queries, drawn.references, checked),
@@ -298,7 +292,6 @@ def compared(drawn: Drawn, features: str) -> Row:
             drawn.black_queries, drawn.black_references, pipeline_of(features, StationaryOptions())
         ),
     }
-    return {title: f"{sum(some)} of {len(some)}" for title, some in found.items()}
 
 
 def _unmoved(folder: Path) -> Iterator[Row]:
@@ -359,8 +352,17 @@ def worse(image: Image, exponent: float, noise: float, blur_px: float) -> Image:
     return darker
 
 
-def _alternatives(folder: Path, key: str) -> Iterator[Row]:
-    field = QUESTIONS[key].constant.split(".")[-1]
+def _alternatives(field: str, folder: Path) -> Iterator[Row]:
     sets = windows(clean(folder, DRIVE, make_extractor("sift")))
-    for options in _ALTERNATIVES[key]:
-        yield {field: getattr(options, field), "ignored, %": f"{100 * ignored_share(sets, options):.2f}"}
+    for value in _ALTERNATIVES[field]:
+        options = replace(StationaryOptions(), **{field: value})
+        yield {field: value, "ignored, %": f"{100 * ignored_share(sets, options):.2f}"}
+
+
+MEASUREMENTS = {
+    "stationary-overlays": Measurement(_overlays),
+    "stationary-contradicted-px": Measurement(partial(_alternatives, "contradicted_px")),
+    "stationary-support": Measurement(partial(_alternatives, "support")),
+    "stationary-unmoved-px": Measurement(_unmoved, least("other places localized")),
+    "stationary-same-view-share": Measurement(_same_view, least("another place with the same overlay, taken for it")),
+}

@@ -11,27 +11,11 @@ from mapless_tools.child import temporary_server
 from mapless_tools.evaluate.metrics import pose_error
 
 from .overlays import OVERLAYS, Image, Overlay
-from .page import Question, Row
+from .page import Measurement, Row
 from .stationary import RIGHT_M, Scene, scenes_in
 
 OTHERS, RIGHT = 4, 3
 """Photographs of other places, and of the place itself, for each scene and overlay."""
-QUESTION = Question(
-    "stationary-overlays-auto",
-    "mapless_server.method.pairs.stationary:StationaryOptions.unmoved_px",
-    "How many photographs of other places does a server with `auto` localize because they carry the same picture as "
-    "the references, and how many of the place itself?",
-    f"The scenes and overlays of [stationary-overlays](stationary-overlays.md), {OTHERS} photographs of other places "
-    f"and {RIGHT} of the place itself for each, through a server with `MAPLESS_FEATURES=auto` and the weights of "
-    "EdgePoint2, ALIKED and LightGlue, on a CPU. Each overlay is on another scene than the one before, so that the "
-    "first rows have all of them.",
-    "The same options for all features. The rows are as many as were measured, at 0d3f8164.",
-)
-
-
-def measure(key: str, folder: Path) -> tuple[Question, Iterator[Row]]:
-    """Measures it row by row."""
-    return QUESTION, _rows(folder)
 
 
 def _rows(folder: Path) -> Iterator[Row]:
@@ -75,3 +59,6 @@ def _pose(client: Client, image: bytes, camera: Camera, scene: str) -> RigidTran
 def _encoded(image: Image, overlay: Overlay, number: int) -> bytes:
     drawn = np.ascontiguousarray(overlay(image, number)[0][..., ::-1])
     return cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, 92])[1].tobytes()
+
+
+MEASUREMENTS = {"stationary-overlays-auto": Measurement(_rows)}

@@ -2,59 +2,15 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 
 from mapless_server.method.promise import PROMISE, WORTH
 from research.contradictions.places import place_reader
 from research.doubt.climbing import Climb, climbs
 
-from .page import Question, Row
+from .page import Measurement, Row
 
-DATA = (
-    "photographs of each folder of shared/data (6) and of other places (2), asked in it with 5 references (kitchen "
-    "3, lockers 12, statue 20) that are evenly spread; `auto` with EdgePoint2 L64, SIFT, ALIKED and LightGlue; the "
-    "engine makes every attempt, worth it or not. Shares are (n + 1/2) / (all + 1), since few are tried. Processor "
-    "time is that of the thread, beside another process."
-)
-QUESTIONS = {
-    "rungs-worth": Question(
-        "rungs-worth",
-        "mapless_server.method.promise:WORTH",
-        "Which share of the photographs of the place that have no accepted pose, but agree with two references, does "
-        "a rung answer, at what cost?",
-        DATA,
-        "An attempt is made if its share, times the chance that two references show the same (see place-agreement), is "
-        "at least 0.02 for each second. `stronger` includes what follows it, time and answers: of 4 photographs here "
-        "that get a network 2 are answered right, of 9 of the list of doubtful ones 4. Costs are those of a quiet "
-        "machine with stored pairs of references, which `wide` and `rematched` did not have here; shares at any roll "
-        "are those of an earlier measurement with more photographs "
-        "(0 of 9 and 1 of 40). An accepted pose is checked by stronger features only if it is of low trust and no "
-        "other features found one there: of 29 such poses in a hundred that are wrong (2,528 photographs, see "
-        "`DoubtOptions`) stronger features are assumed to correct a third, which is not measured.",
-    ),
-    "place-agreement": Question(
-        "place-agreement",
-        "mapless_server.method.promise:PromiseOptions.agreement",
-        "How large an agreement of matches (see `features.rolls.Similarity`) do two references reach, of photographs "
-        "of the place and of others, after the photograph as it is and SIFT, where the first attempt left a doubt?",
-        DATA,
-        "A pose needs two references, so the second largest agreement counts. 3.0 is above all photographs of other "
-        "places and below those that a network answers right (3.4 and more; the three right ones below 3.0 were "
-        "answered without one). Chosen by the other places alone, half way between the two, it differs where one of "
-        "the two nearest is left out: the last row. The logistic's spread is 0.25, so that at 2.4 the cheap rungs are "
-        "still tried, but no stronger features: of the list of doubtful photographs `wide` answers one there for 0.07 "
-        "s. `rolls.LEAST_AGREEMENT` is for a single reference: in an earlier run of this program, with the largest "
-        "agreement instead of the second, photographs of other places reached 4.4.",
-    ),
-}
 THRESHOLDS = (1.5, 2.0, 2.4, 2.7, 3.0, 4.0, 6.0)
 KNOWN_AFTER = ("as it is", "any roll")
-
-
-def measure(key: str, scenes: Path) -> tuple[Question, Iterator[Row]]:
-    """The question of a key, and the rows of its table."""
-    found = list(climbs(place_reader(scenes)))
-    return QUESTIONS[key], iter(shares(found) if key == "rungs-worth" else agreements(found))
 
 
 def shares(found: Sequence[Climb]) -> Iterator[Row]:
@@ -130,3 +86,9 @@ def _row(name: str, chosen: Sequence[tuple[Climb, bool]]) -> Row:
             [above for it, above in chosen if it.is_own and it.is_right and _is_by_network(it)]
         ),
     }
+
+
+MEASUREMENTS = {
+    "rungs-worth": Measurement(lambda scenes: shares(list(climbs(place_reader(scenes))))),
+    "place-agreement": Measurement(lambda scenes: agreements(list(climbs(place_reader(scenes))))),
+}

@@ -25,7 +25,8 @@ from ..optim.optimize import cross_matrices
 FUNDAMENTAL_PX = 1.5
 """Largest distance from the epipolar lines of an estimated matrix; keypoints are accurate to about a pixel."""
 MIN_MATCHES = 24
-"""Fewer inliers of it are no evidence: any eight matches satisfy some fundamental matrix."""
+"""Fewer inliers of it are no evidence: any eight matches satisfy some fundamental matrix. Evidence:
+scene-agreement."""
 SAME_PLACE = 1e-6
 """Cameras that are nearer than this are at one place; in the unit of the poses."""
 PARALLAX_PX = 4.0

@@ -35,15 +35,19 @@ class StationaryOptions:
     Attributes:
         same_px: largest distance between the pixels of a match that are the same.
         contradicted_px: smallest distance of a pixel from all those that the poses can explain; greater than what poses
-            and intrinsics of references are off.
+            and intrinsics of references are off. Evidence: stationary-contradicted-px.
         unmoved_px: largest distance between the pixels of a match that what is fixed to the camera may have: strokes of
-            half-transparent letters are found less exactly than corners.
+            half-transparent letters are found less exactly than corners. Evidence: stationary-unmoved-px,
+            stationary-overlays-auto.
         same_view_share: if two photographs match at the same pixels in so many of the parts where either has keypoints,
             both show the same from the same place. Parts, because a badge in a corner may have most of the keypoints.
+            Evidence: stationary-same-view-share.
         parts: number of columns of the grid of these parts.
-        support: number of matches, of different pairs or at different pixels, that show that a cell is fixed.
+        support: number of matches, of different pairs or at different pixels, that show that a cell is fixed. Evidence:
+            stationary-support.
         cells: number of columns of the grid on which they are counted.
-        reach: cells to each side that are counted together, and ignored around a cell that is fixed.
+        reach: cells to each side that are counted together, and ignored around a cell that is fixed. Evidence:
+            stationary-overlays.
     """
 
     same_px: float = 1.0

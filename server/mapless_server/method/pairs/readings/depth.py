@@ -13,7 +13,7 @@ MIN_POINTS = 100
 """Fewer give no typical depth."""
 MIN_DEPTH_M, MAX_DEPTH_M = 0.05, 500.0
 """Typical depths of photographs of places are 0.3 to 300 m. Those in millimetres come out a thousand times as large, in
-kilometres as small."""
+kilometres as small. Evidence: scene-agreement."""
 
 
 def median_depth(views: Views, matched: Sequence[MatchedPair]) -> float | None:
