@@ -14,6 +14,7 @@ from typing import Any
 import grpc
 import pytest
 from support.clients import Connect, awaiting, failing, losing, status
+from support.images import encode, textured
 from support.servers import CAMERA, PHOTO, RunningServer, make_scene, pose, serving
 
 import mapless
@@ -108,25 +109,6 @@ def test_the_life_of_a_scene(server: RunningServer, connect: Connect, tmp_path: 
 
 
 @both
-@pytest.mark.parametrize("code", ["RESOURCE_EXHAUSTED", "UNAVAILABLE"])
-def test_a_server_that_is_busy_twice_answers_the_third_time(connect: Connect, code: str) -> None:
-    rejected: Any = localization_pb.LocalizeResponse()
-    rejected.rejection.reason = 99
-    photo = bytes(3 * 2**20)  # larger than gRPC would repeat unasked
-    with (
-        failing([status(code, 0.15)] * 2, lambda method, data: rejected.SerializeToString()) as (address, server),
-        connect(address, FAST) as client,
-    ):
-        start_s = time.monotonic()
-        answer = client.localize(photo, CAMERA, "s", timeout_s=20.0)
-        took_s = time.monotonic() - start_s
-    assert getattr(answer, "reason", None) == "99"  # newer than this client
-    assert took_s >= (0.3 if code == "RESOURCE_EXHAUSTED" else 0.15)
-    assert len(server.tries) == 3
-    assert all(10 < left_s <= 20 for _, left_s in server.tries)
-
-
-@both
 def test_a_change_whose_answer_was_lost_is_made_once(server: RunningServer, connect: Connect) -> None:
     scene = f"lost-{time.monotonic_ns()}"
     references = [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(2)]
@@ -159,59 +141,28 @@ def test_an_interrupted_upload_goes_on(server: RunningServer, connect: Connect, 
             client.add_references(scene, [*wanted[:3], moved])
 
 
-@both
-def test_another_clients_resource_is_not_taken_for_ones_own(
-    server: RunningServer, connect: Connect, scene: str
-) -> None:
-    other = NewReference("r0", PHOTO, CAMERA, pose(0.001))  # a millimetre beside the one that is there
-    with losing(server.address, does_it=False) as (address, between), connect(address, FAST) as client:
-        with pytest.raises(AlreadyExists):
-            client.add_reference(scene, other)
-        assert between.methods == ["CreateReference", "CreateReference", "GetReference"]
-    with (
-        losing(server.address, does_it=False) as (address, _),
-        connect(address, FAST) as client,
-        pytest.raises(AlreadyExists),
-    ):
-        client.create_scene(scene)
-    here = f"here-{time.monotonic_ns()}"
-    with Client(server.address) as maker:
-        maker.create_scene(here, datum=replace(DATUM, latitude_deg=-33.0))
-    with (
-        losing(server.address, does_it=False) as (address, _),
-        connect(address, FAST) as client,
-        pytest.raises(AlreadyExists),
-    ):
-        client.create_scene(here, datum=DATUM)
+def test_a_bulk_upload_is_cut_into_messages(server: RunningServer, client: Client, scene: str) -> None:
+    photos = [encode(".png", textured(seed=i)) for i in range(7)]
+    progress: list[int] = []
+    options = ConnectOptions(batch_mib=2.5 * max(map(len, photos)) / 2**20, batch_count=3)
+    with Client(server.address, options) as small:
+        stored = small.add_references(
+            scene,
+            (NewReference(f"bulk{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(photos)),
+            on_progress=progress.append,
+        )
+    assert [reference.reference_id for reference in stored] == [f"bulk{i}" for i in range(7)]
+    assert progress == [2, 4, 6, 7]
+    assert client.get_reference(scene, "bulk6", include_image=True).image == photos[6]
 
 
-@both
-def test_calls_go_on_when_a_server_restarts(tmp_path: Path, connect: Connect) -> None:
-    with serving(tmp_path) as first, Client(first.address) as setup:
-        make_scene(setup, "s", 2)
-        port = int(first.address.rpartition(":")[2])
-        client = connect(first.address, ConnectOptions(max_attempts=20, max_backoff_s=0.5))
-        client.localize(PHOTO, CAMERA, "s")
-    with client:
-        with pytest.raises(Unavailable):  # without any server the error comes in time
-            client.get_scene("s", timeout_s=0.5)
-        came_back = threading.Event()
-        leave = threading.Event()
-
-        def restart() -> None:
-            time.sleep(0.5)
-            with serving(tmp_path, port=port):
-                came_back.set()
-                leave.wait(60)
-
-        thread = threading.Thread(target=restart)
-        thread.start()
-        try:
-            assert isinstance(client.localize(PHOTO, CAMERA, "s"), LocalizationResult)
-            assert came_back.is_set()
-        finally:
-            leave.set()
-            thread.join(60)
+def test_the_client_names_the_bad_reference_of_a_batch(server: RunningServer, scene: str) -> None:
+    photos = [PHOTO, PHOTO, PHOTO, b"none"]
+    references = [NewReference(f"p{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(photos)]
+    error_text = "IMAGE_UNKNOWN_FORMAT: reference 'p3': the image is not"
+    two_by_two = ConnectOptions(batch_count=2)
+    with Client(server.address, two_by_two) as client, pytest.raises(InvalidArgument, match=error_text):
+        client.add_references(scene, references)
 
 
 def test_closing_a_client_ends_its_pauses() -> None:

@@ -130,12 +130,14 @@ def test_only_what_the_scene_lacks_is_sent_again() -> None:
     assert list(request.requests) == lacked
 
 
-@pytest.mark.parametrize("what", ["photograph", "intrinsics", "pose"])
+@pytest.mark.parametrize("what", ["photograph", "mask", "intrinsics", "pose"])
 def test_a_different_reference_of_the_same_name_is_named(what: str) -> None:
     wanted = requests(3)
     there = [stored(it) for it in wanted]
     if what == "photograph":
         there[2].image_sha256 = "0" * 64
+    elif what == "mask":
+        there[2].mask_sha256 = "0" * 64
     elif what == "intrinsics":
         there[2].intrinsics.focal_x_px += 1
     else:

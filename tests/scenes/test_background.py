@@ -236,6 +236,8 @@ class TestDamage:
         assert found.counts.found["damaged"] > 0
         for pair, matches in Matcher().correspond(PLANTED.query, found.references()).reference_pairs.items():
             np.testing.assert_array_equal(correspondences.reference_pairs[pair], matches)
+        found.background.maintain()
+        assert place.fetch("SELECT count(*) FROM reference_pair") == [(len(usual) - found.counts.found["damaged"],)]
         found.background.match_waiting()
         assert found.counts.made == found.counts.found["damaged"]
         again = found.stored()

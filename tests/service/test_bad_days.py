@@ -5,10 +5,7 @@ gone.
 """
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,13 +24,11 @@ from support.commands import run_client
 from support.disks import fail, failing_disk, mount, small_disk
 from support.images import encode
 from support.servers import CAMERA, PHOTO, StandInMethod, pose, serving
-from support.stores import lose_page_with
 from support.waiting import wait_until
 
 from mapless import (
     Client,
     ConnectOptions,
-    DataLoss,
     DeadlineExceeded,
     LocalizationResult,
     MaplessError,
@@ -48,8 +43,7 @@ from mapless_server.method.judge.answer import Answer
 from mapless_server.serve import running
 from mapless_server.serve.running import watch_store
 from mapless_server.services.handlers import SERVICE_NAMES
-from mapless_server.store import Store, StoreError, deletion
-from mapless_server.store.folder_lock import LOCK_FILE
+from mapless_server.store import StoreError, deletion
 from mapless_server.store.reserve import RESERVE_FILE
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
 from mapless_server.store.verification import verify
@@ -154,37 +148,6 @@ class TestDisk:
                 assert {it.reference_id for it in client.list_references("s")} == stored | {"late"}
             assert faults_of(disk / "data") == ()
 
-    def test_a_scene_is_deleted_in_the_room_of_one_reference(self, tmp_path: Path) -> None:
-        def leave(room_bytes: int) -> None:
-            free = os.statvfs(disk)
-            (disk / "filler").write_bytes(bytes(free.f_bavail * free.f_frsize - room_bytes))
-
-        def count_left() -> int:
-            with closing(SqliteDatabase.open_as_is(disk / "data" / DATABASE_FILE)) as database, database.read() as left:
-                return int(left.exec_driver_sql("SELECT count(*) FROM reference").scalar_one())
-
-        with small_disk(tmp_path / "disk", 32) as disk:
-            with served(disk / "data") as client:
-                for scene in ("s", "t"):
-                    client.create_scene(scene)
-                    client.add_references(scene, [large(i) for i in range(20)])
-            with served(disk / "data") as client:
-                leave(600_000)
-                client.delete_scene("s")
-                assert count_left() == 20
-                (disk / "filler").unlink()
-            with served(disk / "data") as client:
-                (disk / "data" / RESERVE_FILE).unlink()
-                leave(150_000)
-                error = error_of(lambda: client.delete_scene("t"))
-                assert (error and error.code, error and error.reason) == ("RESOURCE_EXHAUSTED", "STORE_FULL")
-                with pytest.raises(NotFound):
-                    client.get_scene("t")
-                assert count_left() > 0
-                (disk / "filler").unlink()
-                wait_until(lambda: count_left() == 0)
-            assert large_photo(7)[1000:1016] not in (disk / "data" / DATABASE_FILE).read_bytes()
-
     def test_what_fills_the_disk_can_be_deleted(self, tmp_path: Path) -> None:
         with small_disk(tmp_path / "disk", 72) as disk, served(disk / "data") as client:
             (disk / "filler").write_bytes(bytes(56 * 2**20))
@@ -253,15 +216,6 @@ class TestDisk:
             assert error is not None
             assert (error.code, error.reason) == ("FAILED_PRECONDITION", "STORE_READ_ONLY")
 
-    def test_a_read_only_store_not_closed_in_order_is_refused(self, tmp_path: Path) -> None:
-        with small_disk(tmp_path / "disk", 16) as disk:
-            with served(disk / "data") as client:
-                fill(client, 1)
-            (disk / "data" / f"{DATABASE_FILE}-wal").write_bytes(b"what was acknowledged last")
-            assert mount("-o", "remount,ro", str(disk)) == 0
-            with pytest.raises(StoreError, match="not closed in order"), served(disk / "data"):
-                pass
-
     @pytest.mark.nightly
     def test_a_disk_that_fails_meanwhile_leaves_what_can_be_served(self, tmp_path: Path) -> None:
         with failing_disk(tmp_path / "disk", 32) as disk, served(disk / "data") as client:
@@ -302,80 +256,6 @@ class TestDisk:
             assert isinstance(late.result(30), DeadlineExceeded)
             goes_on.set()
             assert [len(it.result(60)) for it in listed] == [3, 3]
-
-
-class TestDamagedPages:
-    def damage(self, folder: Path) -> None:
-        """In the middle of the photograph of r1."""
-        lose_page_with(folder / DATABASE_FILE, large_photo(1)[100_000:100_016])
-
-    def test_a_bad_sector_costs_the_reference_stored_there(self, tmp_path: Path) -> None:
-        with served(tmp_path) as client:
-            fill(client)
-        self.damage(tmp_path)
-        assert any("'r1': image" in fault for fault in faults_of(tmp_path))
-        assert not any("'r0'" in fault or "'r2'" in fault for fault in faults_of(tmp_path))
-        with served(tmp_path) as client:
-            with pytest.raises(DataLoss, match="'r1' is damaged") as caught:
-                client.get_reference("s", "r1", include_image=True)
-            assert caught.value.code == "DATA_LOSS"
-            for other in ("r0", "r2"):
-                assert len(client.get_reference("s", other, include_image=True).image or b"") > 100_000
-                assert is_answered(client, other, "r1")
-            assert is_answered(client)
-            client.delete_reference("s", "r1")
-            client.add_reference("s", large(1))
-            assert client.get_reference("s", "r1", include_image=True).image == large_photo(1)
-            assert client.get_scene("s").reference_count == 3
-            assert is_answered(client)
-        assert not any("reference" in fault for fault in faults_of(tmp_path))
-
-    def test_bad_sectors_of_the_schema_stop_the_start_with_advice(self, tmp_path: Path) -> None:
-        with served(tmp_path) as client:
-            fill(client, 1)
-        with (tmp_path / DATABASE_FILE).open("r+b") as file:
-            file.seek(100)
-            file.write(bytes(range(256)) * 15)
-        with pytest.raises(StoreError, match=r"malformed; restore a backup into a new folder$"), served(tmp_path):
-            pass
-
-
-class TestTwoServers:
-    """On one SQLite file, whatever it is called."""
-
-    def opened_by_another(self, *folders: Path) -> list[str]:
-        """The error of a process that opens the store in each folder."""
-        code = """if True:
-            import sys
-            from pathlib import Path
-            from mapless_server.store import Store, StoreError
-            for folder in sys.argv[1:]:
-                try:
-                    Store.open(Path(folder))
-                except StoreError as error:
-                    print(error)
-        """
-        command = [sys.executable, "-c", code, *map(str, folders)]
-        return subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout.splitlines()
-
-    def test_a_second_server_is_refused_until_the_first_has_gone(self, tmp_path: Path) -> None:
-        data = tmp_path / "data"
-        link, soft, hard = (tmp_path / name for name in ("link", "soft", "hard"))
-        link.symlink_to(data)
-        relative = Path(os.path.relpath(data))
-        with served(data):
-            for folder in (soft, hard):
-                folder.mkdir()
-            (soft / DATABASE_FILE).symlink_to(data / DATABASE_FILE)
-            os.link(data / DATABASE_FILE, hard / DATABASE_FILE)
-            *by_folder, by_soft, by_hard = self.opened_by_another(data, link, relative, soft, hard)
-            assert all(f"in use by another server (process {os.getpid()})" in error for error in by_folder)
-            assert all("in use by another server, under another name" in error for error in (by_soft, by_hard))
-            # The lock of the folder is deleted: that of the file is still there.
-            (data / LOCK_FILE).unlink()
-            (error,) = self.opened_by_another(data)
-            assert "in use by another server" in error
-        Store.open(data).close()
 
 
 class TestScenesThatGo:

@@ -11,7 +11,7 @@ from support.servers import RunningServer, serving_really
 from support.waiting import wait_until
 
 import mapless_tools.demo
-from mapless import Client, GroupRejected, NewReference, Rejected, RigidTransform, RigImage, SequenceFrame
+from mapless import Client, GroupRejected, NewReference, Rejected, RigidTransform, SequenceFrame
 from mapless.geometry import Similarity, rotation_from_vector
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.formats.cameras import read_folder
@@ -25,7 +25,6 @@ Reading = Callable[[RigidTransform], RigidTransform]
 READINGS: dict[str, Reading] = {
     "right": lambda pose: pose,
     "opengl": lambda pose: RigidTransform(pose.rotation @ np.diag([1.0, -1.0, -1.0]), pose.translation),
-    "inverse": lambda pose: pose.inverse(),
     "millimetres": lambda pose: RigidTransform(pose.rotation, 1000 * pose.translation),
 }
 OTHER_ROTATION = np.array([0.1, 0.7, -0.2])
@@ -58,37 +57,20 @@ def client(server: RunningServer) -> Iterator[Client]:
         yield client
 
 
-@pytest.mark.parametrize(("scene", "likely"), [("opengl", "OpenGL"), ("inverse", "camera_from_world")])
-def test_wrong_poses_are_said_and_answer_nothing(client: Client, scene: str, likely: str) -> None:
-    wait_until(lambda: likely in client.get_scene(scene).contradiction)
-    known = client.get_scene(scene)
+def test_wrong_poses_are_said_and_answer_nothing(client: Client) -> None:
+    wait_until(lambda: "OpenGL" in client.get_scene("opengl").contradiction)
+    known = client.get_scene("opengl")
     assert known.warnings == (known.contradiction,)
     assert known.agreeing_pair_count < known.compared_pair_count / 2
-    for frame in QUERIES:
-        answer = client.localize(frame.image_path, frame.camera, scene, timeout_s=PATIENT_S)
-        assert isinstance(answer, Rejected)
+    sequence = [SequenceFrame(it.image_path, it.camera, it.world_from_camera) for it in QUERIES]
+    alone = client.localize(QUERIES[0].image_path, QUERIES[0].camera, "opengl", timeout_s=PATIENT_S)
+    together = client.localize_sequence(sequence, "opengl", timeout_s=PATIENT_S)
+    assert isinstance(alone, Rejected)
+    assert isinstance(together, GroupRejected)
+    for answer in (alone, together):
         assert answer.hint is not None
         assert answer.hint.advice == "CHECK_REFERENCE_POSES"
-        assert known.contradiction.partition(":")[0] in answer.message
-        assert not answer.intrinsics_checks
-
-
-def test_joint_rejections_say_the_contradiction(client: Client) -> None:
-    scene = "opengl"
-    wait_until(lambda: bool(client.get_scene(scene).contradiction))
-    rig = [
-        RigImage(it.image_path, it.camera, QUERIES[0].world_from_camera.inverse().compose(it.world_from_camera))
-        for it in QUERIES
-    ]
-    sequence = [SequenceFrame(it.image_path, it.camera, it.world_from_camera) for it in QUERIES]
-    for joint in (
-        client.localize_rig(rig, scene, timeout_s=PATIENT_S),
-        client.localize_sequence(sequence, scene, timeout_s=PATIENT_S),
-    ):
-        assert isinstance(joint, GroupRejected)
-        assert joint.hint is not None
-        assert joint.hint.advice == "CHECK_REFERENCE_POSES"
-        assert joint.message.count("the scene contradicts itself") == 1
+        assert answer.message.count("the scene contradicts itself") == 1
 
 
 def test_a_second_session_is_said_with_the_similarity_that_aligns_it(client: Client) -> None:
@@ -124,17 +106,9 @@ def test_millimetres_are_warned_of_and_reject_nothing(client: Client) -> None:
     wait_until(lambda: len(client.get_scene("millimetres").warnings) > 0)
     known = client.get_scene("millimetres")
     assert known.contradiction == ""
-    assert any("are the poses in millimetres?" in it for it in known.warnings)
     again = client.add_reference("millimetres", reference(ALL[5], READINGS["millimetres"]))
-    assert any("are the poses in millimetres?" in it for it in again.warnings)
-    for frame in QUERIES:
-        right, answer = (
-            client.localize(frame.image_path, frame.camera, scene, timeout_s=PATIENT_S)
-            for scene in ("right", "millimetres")
-        )
-        assert isinstance(answer, type(right))
-        hint = answer.hint if isinstance(answer, Rejected) else None
-        assert hint is None or hint.advice != "CHECK_REFERENCE_POSES"
+    for warnings in (known.warnings, again.warnings):
+        assert any("are the poses in millimetres?" in it for it in warnings)
     client.update_scene("millimetres", arbitrary_unit=True)
     assert not any("millimetres" in it for it in client.get_scene("millimetres").warnings)
 
@@ -143,16 +117,10 @@ def test_right_poses_are_not_accused(client: Client) -> None:
     known = client.get_scene("right")
     assert (known.contradiction, known.warnings) == ("", ())
     assert known.agreeing_pair_count == known.compared_pair_count > 0
-    answers = [client.localize(it.image_path, it.camera, "right", timeout_s=PATIENT_S) for it in QUERIES]
-    hints = [it.hint for it in answers if isinstance(it, Rejected)]
-    assert all(it is not None and it.advice != "CHECK_REFERENCE_POSES" for it in hints)
-
-
-def test_the_metric_counts_the_scenes(server: RunningServer) -> None:
-    wait_until(lambda: server.value("mapless_contradicting_scenes") >= 3)
 
 
 def test_the_audit_says_it_first_and_fails(server: RunningServer) -> None:
+    wait_until(lambda: server.value("mapless_contradicting_scenes") >= 2)
     wrong = run("audit", "opengl", "--text", "--address", server.address)
     assert wrong.exit_code == 1
     assert wrong.stdout.startswith("wrong: the scene contradicts itself: of ")

@@ -3,18 +3,13 @@
 The other callers are answered, each call ends once, and what was acknowledged is stored.
 """
 
-import os
 import random
-import resource
 import signal
 import socket
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,10 +36,8 @@ from support.servers import (
 )
 from support.waiting import wait_until
 
-from bench.load.driving import free_port
 from bench.load.watch import Scrape, read_metrics
 from mapless import (
-    AlreadyExists,
     Client,
     ConnectOptions,
     DeadlineExceeded,
@@ -57,11 +50,10 @@ from mapless import (
 from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.rpc import receiving, sending
+from mapless_server.rpc import receiving
 from mapless_server.serve import running as grpc_server
 
 ONCE = ConnectOptions(max_attempts=1)
-PATIENT = ConnectOptions(max_attempts=50, initial_backoff_s=1.0, max_backoff_s=2.0)
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
 
 
@@ -76,28 +68,6 @@ def is_served(client: Client, scene: str) -> bool:
 
 
 class TestClients:
-    def test_one_that_is_killed_while_it_waits_frees_its_place(self, tmp_path: Path) -> None:
-        caller = """if True:
-            import sys
-            from mapless import Client
-            from mapless.geometry import Camera
-            camera = Camera(96, 64, 80.0, 81.0, 47.5, 31.5)
-            Client(sys.argv[1]).localize(sys.argv[2], camera, "s", timeout_s=300)
-        """
-        photo = tmp_path / "photo.png"
-        photo.write_bytes(PHOTO)
-        with serving(tmp_path / "data", metrics=True, metrics_port=0) as server, Client(server.address) as client:
-            make_scene(client)
-            with server.method.held():
-                victim = subprocess.Popen([sys.executable, "-c", caller, server.address, str(photo)])
-                assert server.method.started.acquire(timeout=30)
-                victim.kill()
-                victim.wait(30)
-                wait_until(lambda: server.engine.queue.job_count == 0)
-                wait_until(lambda: scraped(server.metrics_address).handled["CANCELLED"] == 1)
-                assert scraped(server.metrics_address).terminated["cancelled"] == 1
-            assert is_served(client, "s")
-
     @pytest.mark.nightly("pings")
     @pytest.mark.parametrize("has_call", [True, False])
     def test_pings_every_ten_seconds_end_nothing(self, server: RunningServer, client: Client, has_call: bool) -> None:
@@ -134,35 +104,7 @@ class TestClients:
                 assert is_served(client, scene)
                 assert len(client.get_reference(scene, "large", include_image=True).image or b"") > 1_000_000
 
-    def test_answers_that_nobody_reads_are_limited(
-        self, server: RunningServer, client: Client, scene: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(sending, "UNREAD_BYTES", 4 * 2**20)
-        camera = Camera(800, 600, 700.0, 700.0, 399.5, 299.5)
-        noise = np.random.default_rng(0).integers(0, 256, (600, 800, 3)).astype(np.uint8)
-        client.add_reference(scene, NewReference("large", encode(".png", noise), camera, pose(9)))
-        asked = reference_pb.GetReferenceRequest(name=f"scenes/{scene}/references/large", include_image=True)
-        data, method = asked.SerializeToString(), "/mapless.v1.ReferenceService/GetReference"
-        once = client.acting_for(None)
-        once.options = replace(once.options, max_attempts=1)
-
-        def reason() -> str:
-            try:
-                once.get_reference(scene, "large", include_image=True)
-            except MaplessError as error:
-                return error.reason
-            return ""
-
-        with raw_http2.connect(server.address) as slow:
-            slow.sendall(raw_http2.hello(0) + b"".join(raw_http2.call(it, method, data) for it in range(1, 40, 2)))
-            wait_until(lambda: reason() == "UNREAD_ANSWERS")
-            assert is_served(client, scene)
-        wait_until(lambda: not reason())
-
-    @pytest.mark.parametrize("method", ["grpc.health.v1.Health/Check", "grpc.health.v1.Health/Watch"])
-    def test_callers_that_never_send_block_no_other(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
-    ) -> None:
+    def test_callers_that_never_send_block_no_other(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Open methods take no token, so these callers are unknown; a tenth of the real numbers."""
         for module, name in (
             (grpc_server, "MAX_CONCURRENT_RPCS"),
@@ -174,7 +116,7 @@ class TestClients:
             make_scene(client)
             for _ in range(5):
                 stranger = stack.enter_context(raw_http2.connect(server.address))
-                calls = (raw_http2.begin(stream, f"/{method}") for stream in range(1, 2 * 100, 2))
+                calls = (raw_http2.begin(stream, "/grpc.health.v1.Health/Check") for stream in range(1, 2 * 100, 2))
                 stranger.sendall(raw_http2.hello() + b"".join(calls))
                 assert is_served(client, "s")
             assert is_served(client, "s")
@@ -196,46 +138,6 @@ class TestClients:
         error = failure_of(stubs.localization.Localize, localize_request(scene), metadata=too_much)
         assert error.code == "RESOURCE_EXHAUSTED"
         assert stubs.localization.Localize(localize_request(scene), timeout=30).HasField("localization")
-
-    def test_a_thousand_silent_connections_block_no_call(self, tmp_path: Path) -> None:
-        with enough_files(2500), real(tmp_path / "server") as server, ExitStack() as stack:
-            address, process = server.address, Path(f"/proc/{server.process.pid}")
-            client = stack.enter_context(Client(address))
-            client.create_scene("s")
-            files, memory_mib = open_files(process), resident_mib(process)
-            idle = [stack.enter_context(raw_http2.connect(address)) for _ in range(1000)]
-            for connection in idle[:800]:  # the others do not even begin HTTP/2
-                connection.sendall(raw_http2.hello())
-            wait_until(lambda: open_files(process) >= files + 1000)
-            for _ in range(20):
-                assert client.get_scene("s").reference_count == 0
-            assert client.is_serving()
-            assert resident_mib(process) < memory_mib + 150
-            for connection in idle:
-                connection.close()
-            wait_until(lambda: open_files(process) < files + 20)
-            assert client.get_scene("s").reference_count == 0
-
-
-@contextmanager
-def enough_files(count: int) -> Iterator[None]:
-    """So many files may be open here and in children, meanwhile."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if hard not in (-1, resource.RLIM_INFINITY) and hard < count:
-        pytest.skip(f"at most {hard} open files are allowed here")
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, count), hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
-def open_files(process: Path) -> int:
-    return len(os.listdir(process / "fd"))
-
-
-def resident_mib(process: Path) -> float:
-    return int((process / "statm").read_text().split()[1]) * resource.getpagesize() / 2**20
 
 
 class TestMethods:
@@ -326,48 +228,6 @@ def code_of(call: Callable[[], object]) -> str:
 
 
 class TestProcess:
-    def test_a_kill_under_load_loses_nothing_acknowledged(self, tmp_path: Path) -> None:
-        """Clients go on as if nothing had happened: the service config of each tries again."""
-        port = free_port()
-        stop, acknowledged = threading.Event(), [list[str]() for _ in range(3)]
-
-        def work(number: int) -> None:
-            with Client(f"127.0.0.1:{port}", PATIENT) as client:
-                for i in range(10_000):
-                    if stop.is_set():
-                        return
-                    name = f"r-{number}-{i}"
-                    with suppress(AlreadyExists):  # it was stored, and its answer was lost
-                        client.add_reference("s", NewReference(name, PHOTO, CAMERA, pose(i)), timeout_s=50)
-                    acknowledged[number].append(name)
-                    client.localize(PHOTO, CAMERA, "s", [name], timeout_s=50)
-
-        with ExitStack() as stack:
-            pool = stack.enter_context(ThreadPoolExecutor(3))
-            stack.callback(stop.set)
-            with real(tmp_path / "server", port=port) as server:
-                with Client(server.address) as client:
-                    client.create_scene("s")
-                workers = [pool.submit(work, i) for i in range(3)]
-                wait_until(lambda: all(len(it) >= 3 for it in acknowledged) or any(it.done() for it in workers))
-                server.process.kill()
-                assert server.wait() == -signal.SIGKILL
-            before = [len(it) for it in acknowledged]
-            with real(tmp_path / "server", port=port) as server:
-                assert server.address == f"127.0.0.1:{port}"
-                wait_until(
-                    lambda: (
-                        all(len(it) >= n + 3 for it, n in zip(acknowledged, before, strict=True))
-                        or any(it.done() for it in workers)
-                    )
-                )
-                stop.set()
-                for worker in workers:
-                    assert worker.exception(60) is None
-                with Client(server.address) as client:
-                    stored = {it.reference_id for it in client.list_references("s")}
-        assert {name for names in acknowledged for name in names} <= stored
-
     @pytest.mark.parametrize(
         "signals", [[signal.SIGTERM], pytest.param([signal.SIGINT, signal.SIGTERM], marks=pytest.mark.nightly)]
     )

@@ -6,6 +6,7 @@ The photograph shows a window of a room, and its two references stand nearly at 
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -80,42 +81,23 @@ def assert_true(found: Hypothesis) -> None:
 
 
 def test_only_who_asks_has_the_pose(client: Client) -> None:
+    """In the axes and the session of the caller."""
     silent = client.localize(PHOTO, corner.CAMERA, "corner", mask=MASK)
     assert isinstance(silent, Rejected)
     assert NEEDED in silent.message
     assert silent.hypotheses == ()
-    found = the_pose(client.localize(PHOTO, corner.CAMERA, "corner", mask=MASK, include_imprecise_pose=True))
-    assert found.in_axes is not None
-    assert found.in_axes.axes == "OPENCV"
-
-
-def test_it_is_in_the_callers_axes_with_its_session(client: Client) -> None:
     session = corner.pose(1.0)
-    answer = client.localize(
-        PHOTO,
-        corner.CAMERA,
-        "corner",
-        mask=MASK,
-        include_imprecise_pose=True,
-        axes="arkit",
-        session_from_camera=session,
-    )
+    asked: dict[str, Any] = {"include_imprecise_pose": True, "axes": "arkit", "session_from_camera": session}
+    answer = client.localize(PHOTO, corner.CAMERA, "corner", mask=MASK, **asked)
     found = the_pose(answer).in_axes
     assert found is not None
+    assert found.axes == "ARKIT"
     assert found.world_from_session is not None
     placed = found.world_from_session.compose(session)
     np.testing.assert_allclose(placed.translation, TRUE.translation, atol=1.0)
     assert "the pose that is too imprecise, in ARKIT axes" in str(answer)
-
-
-def test_no_answer_before_the_last_is_such_a_pose(client: Client) -> None:
     (only,) = client.localize_progressively(PHOTO, corner.CAMERA, "corner", mask=MASK, include_imprecise_pose=True)
     the_pose(only)
-
-
-def test_a_localized_photograph_has_none(client: Client) -> None:
-    answer = client.localize(PHOTO, corner.CAMERA, "corner", include_imprecise_pose=True)
-    assert not isinstance(answer, Rejected)
 
 
 def test_what_else_speaks_against_it_takes_it_away(client: Client) -> None:

@@ -9,7 +9,7 @@ from PIL import Image
 from support.images import encode
 from support.servers import CAMERA, PHOTO, Stubs, failure_of, localize_request, pose
 
-from mapless import AlreadyExists, Client, InvalidArgument, NewReference, RigImage, SequenceFrame
+from mapless import Client, InvalidArgument, NewReference
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 
@@ -40,14 +40,6 @@ def test_a_mask_is_kept_with_its_reference(client: Client, scene: str) -> None:
     assert {it.reference_id: it.mask_sha256 for it in client.list_references(scene)}["masked"] == digest
     plain = client.get_reference(scene, "r0", include_image=True)
     assert (plain.mask, plain.mask_sha256) == (None, "")
-
-
-def test_the_same_reference_with_another_mask_is_another(client: Client, scene: str) -> None:
-    client.add_references(scene, [new()])
-    client.add_references(scene, [new()])
-    for mask in (None, png(np.flipud(VALUES))):
-        with pytest.raises(AlreadyExists, match="mask"):
-            client.add_references(scene, [new(mask)])
 
 
 def test_a_mask_of_everything_is_no_mask_of_a_reference(client: Client, scene: str) -> None:
@@ -87,18 +79,3 @@ def test_a_wrong_mask_is_refused_by_its_field(stubs: Stubs, scene: str, mask: by
         scene=request.scene, image=request.image, intrinsics=request.intrinsics, mask=mask
     )
     assert failure_of(stubs.references.RetrieveReferences, retrieve).reason == reason
-
-
-def test_masks_of_rigs_and_sequences_are_read(client: Client, scene: str) -> None:
-    """Each names its photograph if it is of another size."""
-    small = png(VALUES[::2, ::2])
-    rig = [RigImage(PHOTO, CAMERA, pose(0.0), mask=MASK), RigImage(PHOTO, CAMERA, pose(1.0), mask=small)]
-    with pytest.raises(InvalidArgument, match="48x32 pixels, the image 96x64") as raised:
-        client.localize_rig(rig, scene)
-    assert raised.value.field == "images[1].mask"
-    frames = [SequenceFrame(PHOTO, CAMERA, pose(float(i)), mask=it) for i, it in enumerate((MASK, small))]
-    with pytest.raises(InvalidArgument) as raised:
-        client.localize_sequence(frames, scene)
-    assert raised.value.field == "frames[1].mask"
-    client.localize(PHOTO, CAMERA, scene, mask=MASK)
-    client.retrieve_references(PHOTO, CAMERA, scene, mask=MASK)

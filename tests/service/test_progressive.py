@@ -15,9 +15,7 @@ from support.corner import photograph
 from support.corner import pose as corner_pose
 from support.messages import essence
 from support.servers import (
-    CAMERA,
     COARSE_X_M,
-    PHOTO,
     RunningServer,
     Staged,
     ending,
@@ -30,10 +28,8 @@ from support.servers import (
 from support.waiting import wait_until, with_enough_time
 
 from mapless import Client, MaplessError, NewReference, RigidTransform, wire
-from mapless.errors import from_rpc_error
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
-from mapless_server.method.rejection import Rejection, RejectionReason
 
 LIMIT_S = 30.0
 
@@ -173,32 +169,6 @@ def test_the_last_message_is_what_localize_answers_bit_for_bit(
         assert np.linalg.norm(found.translation - truth.translation) < 0.02
 
 
-def test_what_cannot_be_localized_is_rejected_once(corner: LocalizationServiceStub) -> None:
-    request = corner_request(corner_pose(0))
-    request.image = PHOTO
-    request.intrinsics.CopyFrom(wire.camera_to_message(CAMERA))
-    (only,) = corner.LocalizeProgressively(request, timeout=LIMIT_S)
-    assert only.is_final
-    assert only.answer.WhichOneof("outcome") == "rejection"
-    assert essence(only.answer, True) == essence(corner.Localize(request, timeout=LIMIT_S), True)
-
-
-def test_a_pose_that_nothing_has_checked_is_not_sent_unasked(server: Serving) -> None:
-    server.method.gate.set()
-    (only,) = asking(server, allow_coarse=False)
-    assert only.is_final
-    assert only.answer.localization.pose_stage == pb.POSE_STAGE_REFINED
-
-
-def test_a_coarse_pose_may_turn_out_to_be_none(server: Serving) -> None:
-    server.method.outcome = Rejection(RejectionReason.GATE, "planted")
-    server.method.gate.set()
-    first, last = asking(server)
-    assert first.answer.WhichOneof("outcome") == "localization"
-    assert last.is_final
-    assert last.answer.rejection.reason == pb.REJECTION_REASON_GATE
-
-
 @pytest.mark.parametrize("coarse", [None, RigidTransform(np.eye(3), np.full(3, np.nan))], ids=["none", "not finite"])
 def test_without_a_coarse_pose_only_the_answer_is_sent(server: Serving, coarse: RigidTransform | None) -> None:
     server.method.coarse = coarse
@@ -247,23 +217,6 @@ def test_where_a_coarse_pose_suffices_the_deadline_ends_it(server: Serving) -> N
     assert last.answer.localization.pose_stage == pb.POSE_STAGE_COARSE
 
 
-def test_misuse_is_reported_as_by_localize(server: Serving) -> None:
-    def both(request: pb.LocalizeRequest) -> tuple[MaplessError, MaplessError]:
-        with pytest.raises(grpc.RpcError) as caught:
-            server.stub.Localize(request, timeout=LIMIT_S)
-        return from_rpc_error(caught.value), ending(server.stub.LocalizeProgressively(request, timeout=LIMIT_S))
-
-    absent, bad_image, bad_camera = localize_request("absent"), localize_request("s"), localize_request("s")
-    bad_image.image = b"GIF89a"
-    bad_camera.intrinsics.focal_x_px = -1
-    for request in (absent, bad_image, bad_camera):
-        plain, progressive = both(request)
-        assert progressive.field is not None
-        assert [getattr(plain, it) for it in ("code", "reason", "field", "message")] == [
-            getattr(progressive, it) for it in ("code", "reason", "field", "message")
-        ]
-
-
 def test_watchers_see_the_answer_once_and_it_counts_once(server: Serving) -> None:
     answered = server.server.value("mapless_answers_total", outcome="localized")
     seen = server.stub.WatchQueries(pb.WatchQueriesRequest(scene="scenes/s"), timeout=LIMIT_S)
@@ -299,14 +252,6 @@ def test_an_accepted_answer_is_sent_while_a_better_one_is_sought(doubting: Servi
     accepted = messages[-2].answer.localization
     assert accepted.HasField("covariance")
     assert accepted.trust == pytest.approx(0.01)
-
-
-def test_an_answer_that_stays_the_best_is_sent_once_before(doubting: Serving) -> None:
-    """The stronger features find nothing: what was sent is the final answer, too."""
-    doubting.method.outcomes = [None, Rejection(RejectionReason.GATE, "planted")]
-    first, last = asking(doubting, allow_coarse=False)
-    assert (first.is_final, last.is_final) == (False, True)
-    assert first.answer.localization == last.answer.localization
 
 
 def test_the_log_has_the_time_of_the_first_answer(server: Serving, caplog: pytest.LogCaptureFixture) -> None:

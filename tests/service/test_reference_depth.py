@@ -219,17 +219,3 @@ def test_a_network_that_is_wrong_keeps_nothing(data_dir: Path, factor: float) ->
         runs = network.runs
         assert runs <= REFERENCES, "once for each reference, not again and again"
     assert Folder(data_dir).fetch("SELECT count(*) FROM reference_depth") == [(0,)]
-
-
-def test_two_references_cannot_be_checked(tmp_path: Path) -> None:
-    data_dir, network = tmp_path / "data", PlantedNetwork()
-    with serving(data_dir, network, **MAKING) as server, Client(server.address) as client:
-        client.create_scene("room")
-        first, second, *others = [
-            NewReference(it.name, it.data, it.camera, it.world_from_camera) for it in references()
-        ]
-        client.add_references("room", [first, second])
-        wait_until(lambda: server.value("mapless_calibrations_total") == 1)
-        assert network.runs == 0
-        client.add_references("room", others)
-        wait_until(lambda: server.value("mapless_depths_total", result="kept") >= REFERENCES - 1)

@@ -12,7 +12,7 @@ import pytest
 from support.images import encode, textured
 from support.messages import set_field
 from support.postgres import shared_cluster
-from support.servers import BLACK, CAMERA, PHOTO, RunningServer, Stubs, failure_of, make_scene, pose, serving
+from support.servers import BLACK, CAMERA, PHOTO, Stubs, failure_of, make_scene, pose, serving
 from support.waiting import wait_until
 
 from mapless import (
@@ -103,21 +103,6 @@ def test_lists_are_paged(client: Client, stubs: Stubs, scene: str) -> None:
     stubs.references.ListScenes(pb.ListScenesRequest(page_size=10**6))
 
 
-def test_a_bulk_upload_is_cut_into_messages(server: RunningServer, client: Client, scene: str) -> None:
-    photos = [encode(".png", textured(seed=i)) for i in range(7)]
-    progress: list[int] = []
-    options = ConnectOptions(batch_mib=2.5 * max(map(len, photos)) / 2**20, batch_count=3)
-    with Client(server.address, options) as small:
-        stored = small.add_references(
-            scene,
-            (NewReference(f"bulk{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(photos)),
-            on_progress=progress.append,
-        )
-    assert [reference.reference_id for reference in stored] == [f"bulk{i}" for i in range(7)]
-    assert progress == [2, 4, 6, 7]
-    assert client.get_reference(scene, "bulk6", include_image=True).image == photos[6]
-
-
 def test_a_batch_larger_than_the_queue_is_described_bit_by_bit(tmp_path: Path) -> None:
     """With room for the computing of no more than a few photographs."""
     references = [NewReference(f"x{i}", PHOTO, CAMERA, pose(i)) for i in range(40)]
@@ -166,15 +151,6 @@ def test_a_blank_reference_is_stored_and_reported(client: Client, scene: str, ca
     stored = client.add_references(scene, [NewReference(it, photos[it], CAMERA, pose(0)) for it in photos])
     assert [it.feature_count for it in stored] == [1, 0]
     wait_until(lambda: any(vars(it).get("fields", {}).get("references_without_features") for it in caplog.records))
-
-
-def test_the_client_names_the_bad_reference_of_a_batch(server: RunningServer, scene: str) -> None:
-    photos = [PHOTO, PHOTO, PHOTO, b"none"]
-    references = [NewReference(f"p{i}", photo, CAMERA, pose(i)) for i, photo in enumerate(photos)]
-    error_text = "IMAGE_UNKNOWN_FORMAT: reference 'p3': the image is not"
-    two_by_two = ConnectOptions(batch_count=2)
-    with Client(server.address, two_by_two) as client, pytest.raises(InvalidArgument, match=error_text):
-        client.add_references(scene, references)
 
 
 def test_names_are_checked_everywhere(client: Client, stubs: Stubs) -> None:

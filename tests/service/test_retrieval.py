@@ -13,14 +13,12 @@ from mapless import (
     Camera,
     Client,
     DataLoss,
-    HeadingPrior,
     InvalidArgument,
     LocalizationResult,
     NewReference,
     NotFound,
     PositionPrior,
     Priors,
-    Rejected,
 )
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
@@ -94,32 +92,9 @@ def test_a_name_that_is_wrong_is_found_out_when_reranking_too(client: Client) ->
     assert caught.value.field == "references[1]"
 
 
-def test_a_pose_against_the_heading_prior_is_rejected(client: Client) -> None:
-    axis = pose(0.0).rotation[:, 2]
-    ahead, behind = (Priors(heading=HeadingPrior(sign * axis, 5.0)) for sign in (1, -1))
-    assert isinstance(client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], priors=ahead), LocalizationResult)
-    answer = client.localize(PHOTOS[0], CAMERA, "hall", ["r00"], priors=behind)
-    assert isinstance(answer, Rejected)
-    assert answer.reason == "PRIOR_CONFLICT"
-    assert "175.0 degrees outside" in answer.message
-
-
 def test_an_empty_scene_has_nothing_to_find(client: Client) -> None:
     client.create_scene("empty")
     assert client.retrieve_references(PHOTOS[0], CAMERA, "empty") == []
-
-
-def test_a_store_without_descriptors_is_described_on_first_use(tmp_path: Path) -> None:
-    """One that was filled before there was retrieval."""
-    with serving(tmp_path) as server, Client(server.address) as client:
-        client.create_scene("s")
-        client.add_references("s", [NewReference(f"r{i}", PHOTOS[i], CAMERA, pose(float(i))) for i in range(3)])
-    with serving(tmp_path, descriptor_name="others") as server, Client(server.address) as client:
-        first, second = (client.localize(PHOTOS[2], CAMERA, "s", reference_count=1) for _ in range(2))
-        for answer in (first, second):
-            assert ids([use.name for use in answer.diagnostics.references]) == ["r2"]
-            assert answer.diagnostics.retrieval == "others"
-        assert ["describe" in it.diagnostics.stage_s for it in (first, second)] == [True, False]
 
 
 @pytest.mark.parametrize("what", ["features", "descriptor", "pose"])
@@ -141,21 +116,6 @@ def test_a_damaged_reference_costs_itself_unless_it_is_named(tmp_path: Path, wha
                 continue
             with pytest.raises(DataLoss, match="'r0' is damaged"):
                 client.localize(PHOTOS[0], CAMERA, "s", ["r1", "r0"], rerank_references=is_reranked)
-
-
-def test_a_damaged_reference_without_descriptor_hides_no_other(tmp_path: Path) -> None:
-    with serving(tmp_path) as server, Client(server.address) as client:
-        client.create_scene("s")
-        client.add_references("s", [NewReference(f"r{i}", PHOTOS[i], CAMERA, pose(float(i))) for i in range(3)])
-    store = Store.open(tmp_path)
-    damage(store, SceneKey("s"), "r0", "features")
-    with serving(tmp_path, descriptor_name="others", store=store) as server, Client(server.address) as client:
-        for _ in range(2):
-            found = client.retrieve_references(PHOTOS[2], CAMERA, "s", 1)
-            assert ids([it.name for it in found]) == ["r2"]
-            answer = client.localize(PHOTOS[2], CAMERA, "s")
-            assert isinstance(answer, LocalizationResult)
-            assert sorted(ids([use.name for use in answer.diagnostics.references])) == ["r1", "r2"]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from support.messages import set_field
 from support.servers import CAMERA, PHOTO, Stubs, failure_of, make_scene, pose, serving
@@ -170,6 +169,7 @@ def test_answers_say_that_the_unit_is_arbitrary(client: Client) -> None:
     answer = client.localize(PHOTO, CAMERA, "units")
     assert isinstance(answer, LocalizationResult)
     assert answer.arbitrary_unit
+    assert client.check_coverage("units", pose(0.5), CAMERA).arbitrary_unit
     with pytest.raises(InvalidArgument, match="unit of length") as caught:
         client.update_scene("units", datum=DATUM)
     assert caught.value.field == "scene.datum"
@@ -221,21 +221,6 @@ def test_a_lens_that_references_contradict_is_said(client: Client, scene: str, m
     known = SceneAttributes(self_calibrations=tuple(SelfCalibration(a, at, 3, lens=lens) for a, at, lens in kinds))
     monkeypatch.setattr(Store, "get_attributes", lambda *_: known)
     assert client.get_scene(scene).warnings == ("a lens",)
-
-
-def test_coverage_has_the_mark_of_an_arbitrary_unit(client: Client, scene: str) -> None:
-    for is_arbitrary in (True, False):
-        client.update_scene(scene, arbitrary_unit=is_arbitrary)
-        assert client.check_coverage(scene, pose(0.5), CAMERA).arbitrary_unit is is_arbitrary
-
-
-def test_a_quaternion_is_answered_normalized(client: Client, scene: str) -> None:
-    almost = Quaternion(0.0, 0.0, -0.6004, -0.8)
-    found = client.update_scene(scene, datum=replace(DATUM, enu_from_world=almost)).datum
-    assert found is not None
-    q = found.enu_from_world
-    assert np.linalg.norm([q.x, q.y, q.z, q.w]) == pytest.approx(1, abs=1e-12)
-    assert (q.z, q.w) == pytest.approx((0.6, 0.8), abs=1e-3)
 
 
 def test_what_is_deleted_leaves_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

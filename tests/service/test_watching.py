@@ -1,7 +1,6 @@
 """WatchQueries through a real server: events, permission, and how a stream ends."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import grpc
 import pytest
 from support.servers import CAMERA, PHOTO, RunningServer, ending, localize_request, pose, serving
 
-from mapless import Client, LocalizationResult, NewReference
+from mapless import Client, NewReference
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 
@@ -68,24 +67,6 @@ def test_answers_of_the_watched_scene_alone_arrive_at_once(
     seen.cancel()
 
 
-def test_what_is_seen_is_what_the_caller_gets(tmp_path: Path) -> None:
-    """Whether the call is captured, too."""
-    with (
-        serving(tmp_path / "data", allow_watching=True, capture_dir=tmp_path / "captured") as server,
-        Client(server.address) as client,
-        grpc.insecure_channel(server.address) as channel,
-    ):
-        fill(client, "hall")
-        stub = LocalizationServiceStub(channel)
-        seen = watching(stub)
-        request = localize_request("hall")
-        request.options.include_debug = True
-        own = stub.Localize(request, timeout=LIMIT_S)
-        assert own.diagnostics.captured
-        assert next(seen).answer == own
-        seen.cancel()
-
-
 def test_it_needs_to_be_allowed(tmp_path: Path) -> None:
     with serving(tmp_path) as closed, grpc.insecure_channel(closed.address) as channel:
         failure = ending(LocalizationServiceStub(channel).WatchQueries(REQUEST, timeout=LIMIT_S))
@@ -109,19 +90,3 @@ def test_the_end_of_the_server_ends_it_at_once(tmp_path: Path) -> None:
             leaving.stop()
             failure = ending(seen)
     assert (failure.code, failure.reason) == ("UNAVAILABLE", "DRAINING")
-
-
-def test_a_watcher_that_reads_nothing_delays_no_stop(tmp_path: Path) -> None:
-    """Leaving `serving` waits for the server's end, and for less than its calls would be given."""
-    with ExitStack() as stack:
-        leaving = stack.enter_context(serving(tmp_path, allow_watching=True, drain_grace_s=60))
-        client = Client(leaving.address)
-        fill(client, "hall")
-        channel = grpc.insecure_channel(leaving.address)
-        seen = watching(LocalizationServiceStub(channel))
-        for _ in range(30):
-            assert isinstance(client.localize(PHOTO, CAMERA, "hall"), LocalizationResult)
-        stack.close()
-        assert seen.is_active()  # for all it knows: it has not read what came before the end
-        client.close()
-        channel.close()

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from sqlalchemy import Connection
 from support.stores import EXTRACTOR, Folder, Place, Shared, assert_same_view, faults_of, make_reference, view_of
+from support.waiting import wait_until
 
 from mapless_server import errors
 from mapless_server.security import DEFAULT_TENANT, SceneKey
@@ -294,6 +295,18 @@ class TestFullDisk:
             with pytest.raises(errors.NotFound):
                 store.delete_scene(OFFICE)
         assert row_counts(place) == EMPTY
+
+    def test_what_is_left_is_deleted_as_soon_as_there_is_room(
+        self, place: Place, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(deletion, "AGAIN_S", 0.01)
+        with place.open() as store:
+            fill(store, OFFICE)
+            with monkeypatch.context() as patch:
+                self.fill_up(patch, 0)
+                with pytest.raises(errors.Overloaded):
+                    store.delete_scene(OFFICE)
+            wait_until(lambda: row_counts(place) == EMPTY)
 
     def test_what_is_left_is_tried_again_by_one_thread_until_it_is_closed(self, tmp_path: Path) -> None:
         with Store.open(tmp_path) as store:
