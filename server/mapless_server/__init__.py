@@ -1,5 +1,10 @@
 """The mapless server."""
 
-from importlib.metadata import version
 
-__version__ = version("mapless")
+def __getattr__(name: str) -> str:
+    """`__version__`, read from the installed package when first asked for, since that takes 40 ms."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib.metadata import version
+
+    return globals().setdefault(name, version("mapless"))
