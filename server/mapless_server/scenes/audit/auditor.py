@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapless_server.method.features.views import PosedView
+from mapless_server.method.pairs.readings.repeats import pose_difference
 from mapless_server.store import LruCache
 
 from .change import SAME_VIEWPOINT, SEEN_ALIKE, Change, find_change
@@ -28,7 +29,6 @@ from .comparison import (
     Likeness,
     compare,
     likeness,
-    pose_difference,
 )
 from .finder import ReferenceFinder
 from .neighbourhood import PairMatches

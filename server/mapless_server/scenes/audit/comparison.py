@@ -10,13 +10,14 @@ from functools import cached_property
 
 import numpy as np
 
-from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless.geometry import Array, RigidTransform
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from mapless_server.method.bundle.significance import least_sigmas
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge.judge import JudgeOptions, judge
 from mapless_server.method.optim.optimize import world_covariance
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.pairs.readings.repeats import pose_difference
 from mapless_server.method.pose.pnp import MIN_MATCHES, PnpOptions, false_alarms, ransac
 from mapless_server.method.structure.model import PixelPoints, PointMatches
 
@@ -224,12 +225,6 @@ def compare(subject: PosedView, neighbours: Sequence[PosedView], pairs: PairMatc
             narrower = [fits[other] for other in fits if set(other.value) <= set(free.value)]
             fits[free] = min([fit_camera(points, camera, starts, free), *narrower], key=lambda fit: fit.cost)
     return Comparison(subject, neighbourhood, matches, neighbour_matches, points, fits)
-
-
-def pose_difference(first: RigidTransform, second: RigidTransform) -> tuple[float, float]:
-    """Distance of the centres in metres, and angle between the rotations in degrees."""
-    apart_m = float(np.linalg.norm(first.translation - second.translation))
-    return apart_m, rotation_angle_deg(first.rotation @ second.rotation.T)
 
 
 class Likeness(Enum):
