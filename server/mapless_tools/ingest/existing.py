@@ -7,13 +7,11 @@ from dataclasses import astuple, dataclass, fields
 import numpy as np
 
 from mapless import AlreadyExists, Client, Reference
-from mapless.geometry import Camera, RigidTransform, rotation_angle_deg
+from mapless.geometry import Camera, RigidTransform
+from mapless_server.method.pairs.readings.repeats import pose_difference
+from mapless_server.scenes.repeats import SAME_POSITION_M, SAME_ROTATION_DEG
 from mapless_tools.dataset import Dataset, Frame
 
-SAME_POSITION_M = 1e-3
-SAME_ROTATION_DEG = 0.01
-"""Poses of one photograph this close are equal: they are stored and sent rounded, and two equal frames of a video that
-stands still were posed one by one."""
 _SAME_SHARE = 1e-9
 
 
@@ -99,8 +97,7 @@ def _camera_difference(there: Camera, new: Camera) -> str:
 
 
 def _pose_difference(there: RigidTransform, new: RigidTransform) -> str:
-    apart_m = float(np.linalg.norm(there.translation - new.translation))
-    turned_deg = rotation_angle_deg(there.rotation.T @ new.rotation)
+    apart_m, turned_deg = pose_difference(there, new)
     if apart_m <= SAME_POSITION_M and turned_deg <= SAME_ROTATION_DEG:
         return ""
     return f"its pose is {apart_m:.6g} m and {turned_deg:.6g} degrees away"

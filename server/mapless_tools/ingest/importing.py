@@ -11,11 +11,12 @@ from rich.console import Console
 from mapless import Client, MaplessError, Reference
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ImageLimits, image_size
+from mapless_server.images import ImageLimits
 from mapless_server.method.pairs.readings.depth import implausible_depth
 from mapless_server.method.pairs.readings.verdict import Verdict
 from mapless_server.scenes.plausibility import another_unit, contradictions
 from mapless_server.serve.signals import terminable
+from mapless_server.services.messages.references import nearly_ignored
 from mapless_server.settings import Settings
 from mapless_server.store import ContradictingDown, DatumWithoutMetres, SceneAttributes
 from mapless_tools.child import ServerFailed
@@ -38,10 +39,7 @@ from .report import (
     to_json,
     verdict_lines,
 )
-from .upload import Uploader
-
-MUCH_IGNORED = 0.8
-"""Share of a photograph: a mask that ignores more is most likely inverted."""
+from .upload import Uploader, read_item
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ def run_import(
     with terminable(), _reported(report, report_file):
         if options.check:
             with progress_bars() as progress:
-                _warn(report, [much_ignored(frames)])
+                _warn(report, much_ignored(frames))
                 report.verdict = check_frames(frames, progress)
             for line in verdict_lines(report.verdict, frames):
                 _print(line)
@@ -142,19 +140,14 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
     return dataset, tuple(_prefixed(frame, options.id_prefix) for frame in frames)
 
 
-def much_ignored(frames: Sequence[Frame]) -> str:
-    """A warning if the first mask ignores most of its photograph, as an inverted one does; empty otherwise."""
+def much_ignored(frames: Sequence[Frame]) -> list[str]:
+    """A warning if the first mask ignores most of its photograph, as an inverted one does; else empty."""
     masked = next((frame for frame in frames if frame.mask_path is not None), None)
     try:
         ignored = None if masked is None else masked.read_ignored()
     except (OSError, InvalidArgument):  # refused by name, where it is read
-        return ""
-    if masked is None or ignored is None or ignored.mean() <= MUCH_IGNORED:
-        return ""
-    return (
-        f"the mask {masked.mask_path} ignores {100 * ignored.mean():.0f} % of {masked.name}: 0 means ignore, every "
-        "other value use; is it inverted?"
-    )
+        return []
+    return [] if masked is None or ignored is None else nearly_ignored({masked.name: float(ignored.mean())})
 
 
 def leave_same_poses(report: ImportReport, verdict: Verdict) -> None:
@@ -165,22 +158,21 @@ def leave_same_poses(report: ImportReport, verdict: Verdict) -> None:
 
 
 def refuse_wrong_images(report: ImportReport) -> None:
-    """Refuses the chosen frames whose image a server would reject by its header; for a dry run."""
-    for frame in report.chosen:
-        try:
-            size = image_size(frame.image_path.read_bytes(), ImageLimits())
-        except (OSError, InvalidArgument) as error:
-            report.refused.append(Refusal(frame.name, str(error)))
-            continue
-        camera = frame.camera
-        if size != (camera.width_px, camera.height_px):
-            reason = f"has {size[0]}x{size[1]} pixels, its camera {camera.width_px}x{camera.height_px}"
-            report.refused.append(Refusal(frame.name, f"{frame.image_path.name} {reason}"))
-            continue
-        try:
-            frame.read_ignored()
-        except (OSError, InvalidArgument) as error:
-            report.refused.append(Refusal(frame.name, f"{frame.mask_path}: {error}"))
+    """Refuses the chosen frames whose image, by its header, or mask a server would reject; for a dry run."""
+    faults = [(frame.name, _fault_of_files(frame)) for frame in report.chosen]
+    report.refused += [Refusal(name, fault) for name, fault in faults if fault]
+
+
+def _fault_of_files(frame: Frame) -> str:
+    """Why a frame's image or mask is wrong; empty if both are right."""
+    try:
+        read_item(frame, ImageLimits())
+        frame.read_ignored()
+    except ValueError as error:
+        return str(error)
+    except (OSError, InvalidArgument) as error:
+        return f"{frame.mask_path}: {error}"
+    return ""
 
 
 def _store(report: ImportReport, options: ImportOptions, settings: Settings, connection: Connection) -> None:

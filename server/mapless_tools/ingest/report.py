@@ -7,8 +7,8 @@ from typing import Any
 from rich.console import Console
 
 from mapless_server.method.pairs.readings.alignment import Alignment
-from mapless_server.method.pairs.readings.repeats import is_start
 from mapless_server.method.pairs.readings.verdict import Verdict
+from mapless_server.scenes.repeats import same_pose_text
 from mapless_tools.dataset import Dataset, Frame, Refusal
 from mapless_tools.output_files import finite
 
@@ -20,7 +20,7 @@ WRONG_WORLD = (
     "nothing is stored while the photographs do not fit the scene's references; --align-to-scene aligns them, "
     "--skip-check stores them all the same"
 )
-SHOWN, SHOWN_NAMES = 20, 5
+SHOWN = 20
 ALREADY_THERE = "already there"
 
 
@@ -66,7 +66,11 @@ class ImportReport:
 
 def verdict_lines(verdict: Verdict, frames: Sequence[Frame]) -> list[str]:
     """The result of the epipolar check, a sentence per line."""
-    lines = [f"warning: {same_pose_text(verdict, group, frames)}" for group in verdict.same_pose]
+    lines: list[str] = []
+    for group in verdict.same_pose:
+        names = [frames[i].name for i in group]
+        text = same_pose_text("that show different things", names, frames[group[0]].world_from_camera)
+        lines.append(f"warning: {text}")
     lines += [
         f"warning: {frames[i].name} and {frames[j].name} are the same photograph, with poses that differ"
         for i, j in verdict.same_photograph
@@ -110,18 +114,6 @@ def not_aligned(found: Alignment | None) -> str:
         f"{found.pair_count} pairs do not fit, the scale is known to {100 * found.scale_sigma:.2g} %, the rotation to "
         f"{found.rotation_sigma_deg:.2g} degrees, the position to {100 * found.position_sigma:.2g} % of the extent"
     )
-
-
-def same_pose_text(verdict: Verdict, group: Sequence[int], frames: Sequence[Frame]) -> str:
-    """One sentence about photographs of different things with the same pose."""
-    names = ", ".join(frames[i].name for i in group[:SHOWN_NAMES])
-    more = f" and {len(group) - SHOWN_NAMES} more" if len(group) > SHOWN_NAMES else ""
-    identity = (
-        "the identity: had tracking not begun?"
-        if is_start(frames[group[0]].world_from_camera)
-        else "and one only can be right"
-    )
-    return f"{len(group)} references have exactly the same pose but show different things ({names}{more}): {identity}"
 
 
 def print_report(report: ImportReport, console: Console) -> None:

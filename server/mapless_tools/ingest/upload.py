@@ -12,11 +12,13 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
 from typing import NoReturn
 
 from mapless import Client, NewReference, errors
 from mapless_server.errors import InvalidArgument as BadImage
-from mapless_server.images import check_mask, image_size
+from mapless_server.images import ImageLimits, check_mask, image_size
 from mapless_tools.dataset import Frame, Refusal
 from mapless_tools.progress import Progress
 
@@ -164,34 +166,32 @@ class Uploader:
         raise _Stopped
 
 
-def read_item(frame: Frame) -> Item:
-    """Reads a frame's image; ValueError if it cannot be a photograph of the frame's camera."""
-    file, camera = frame.image_path, frame.camera
-    try:
-        image = file.read_bytes()
-        width, height = image_size(image, ANY_SIZE)
-    except OSError as error:
-        raise ValueError(f"{file} cannot be read: {error.strerror}") from error
-    except BadImage as error:
-        raise ValueError(f"{file}: {error}") from error
+def read_item(frame: Frame, limits: ImageLimits = ANY_SIZE) -> Item:
+    """Reads a frame's image and mask; ValueError if they cannot be a photograph of the frame's camera and its mask."""
+    camera = frame.camera
+    with _named(frame.image_path):
+        image = frame.image_path.read_bytes()
+        width, height = image_size(image, limits)
     if (width, height) != (camera.width_px, camera.height_px):
-        raise ValueError(f"{file} has {width}x{height} pixels, its camera {camera.width_px}x{camera.height_px}")
-    mask = _read_mask(frame)
+        raise ValueError(
+            f"{frame.image_path} has {width}x{height} pixels, its camera {camera.width_px}x{camera.height_px}"
+        )
+    mask = None
+    if frame.mask_path is not None:
+        with _named(frame.mask_path):
+            mask = frame.mask_path.read_bytes()
+            check_mask(mask, (width, height), limits)
     digests = [hashlib.sha256(it).hexdigest() if it else "" for it in (image, mask)]
     new = NewReference(frame.name, image, camera, frame.world_from_camera, mask)
     return new, Stored(frame.name, digests[0], camera, frame.world_from_camera, digests[1])
 
 
-def _read_mask(frame: Frame) -> bytes | None:
-    """Reads a frame's mask; ValueError if it cannot be the mask of its photograph."""
-    file, camera = frame.mask_path, frame.camera
-    if file is None:
-        return None
+@contextmanager
+def _named(file: Path) -> Iterator[None]:
+    """Makes an error of reading a file, or of what it holds, a ValueError that names it."""
     try:
-        mask = file.read_bytes()
-        check_mask(mask, (camera.width_px, camera.height_px), ANY_SIZE)
+        yield
     except OSError as error:
         raise ValueError(f"{file} cannot be read: {error.strerror}") from error
     except BadImage as error:
         raise ValueError(f"{file}: {error}") from error
-    return mask
