@@ -5,6 +5,7 @@ the scale of the output: align it with them afterwards, as with Pi3. The officia
 fifth of its weights, is left out, since no query has depths.
 """
 
+import math
 from abc import abstractmethod
 from dataclasses import dataclass
 
@@ -53,8 +54,12 @@ class Sizes:
 
 
 class PiNetwork(Network):
-    """The common part of Pi3 and Pi3X."""
+    """The common part of Pi3 and Pi3X, whose heads of points and confidence differ."""
 
+    point_head: nn.Module
+    conf_head: nn.Module
+    max_log_depth = math.inf
+    """Largest logarithm of a depth."""
     file_names = FileNames(unused_prefixes=UNUSED)
     image_mean: Tensor
     image_std: Tensor
@@ -127,9 +132,12 @@ class PiNetwork(Network):
         points, logits = self.read_maps(decoded.flatten(0, 1), layout)
         return points.unflatten(0, shape), logits.unflatten(0, shape)
 
-    @abstractmethod
     def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
-        """Local points (V, H, W, 3) and confidence logits (V, H, W) of decoded tokens (V, T, 2 C)."""
+        """Points (V, H, W, 3), without metric scale, and confidence logits (V, H, W) of decoded tokens (V, T, 2 C)."""
+        x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
+        z = torch.exp(log_z.clamp_max(self.max_log_depth))
+        confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)
+        return torch.stack([x * z, y * z, z], dim=-1), confidence[..., 0]
 
 
 class Pi3(PiNetwork):
@@ -165,23 +173,16 @@ class Pi3(PiNetwork):
         points, logits = self.maps(decoded[:, :mapped], layout)
         return NetworkOutput(points, logits, self.cameras(decoded, layout))
 
-    def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
-        """See PiNetwork.read_maps."""
-        x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
-        z = torch.exp(log_z)
-        confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)
-        return torch.stack([x * z, y * z, z], dim=-1), confidence[..., 0]
-
 
 INJECTION_PERIOD = 8
 """Poses are injected after block 1 and every eighth from there."""
-MAX_LOG_DEPTH = 15.0
 
 
 class Pi3X(PiNetwork):
     """The network of Pi3X, without its part for depths."""
 
     conditioned = True
+    max_log_depth = 15.0
     metre_sigma = 0.31
     """A third party found a mean error of the scale of 25 % on ETH3D, for a normal distribution 0.8 of this."""
 
@@ -256,13 +257,6 @@ class Pi3X(PiNetwork):
         """Scale (B,) of each scene, approximately metres per unit."""
         scale: Tensor = self.metric_head(self.metric_decoder(self.metric_token, decoded.flatten(1, 2), layout.rope))
         return scale.exp()[:, 0]
-
-    def read_maps(self, decoded: Tensor, layout: TokenLayout) -> tuple[Tensor, Tensor]:
-        """See PiNetwork.read_maps; the result is without the metric scale."""
-        x, y, log_z = self.point_head(self.point_decoder(decoded, layout.rope), layout.grid).unbind(-1)
-        z = torch.exp(log_z.clamp_max(MAX_LOG_DEPTH))
-        confidence = self.conf_head(self.conf_decoder(decoded, layout.rope), layout.grid)
-        return torch.stack([x * z, y * z, z], dim=-1), confidence[..., 0]
 
 
 def _scaling_column(scale: Tensor) -> Tensor:
