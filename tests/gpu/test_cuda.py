@@ -103,10 +103,10 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_vectors_are_the_cpus_but_for_rounding(file: Path) -> None:
-    on_host, on_device = (MegaLocDescriptor(file, device, SMALL_MEGALOC, 24, 3) for device in ("cpu", "cuda"))
+    on_host, on_device = (MegaLocDescriptor(file, device, SMALL_MEGALOC, 24) for device in ("cpu", "cuda"))
     assert (on_host.dtype, on_device.dtype) == (torch.float32, torch.bfloat16)
     assert on_host.name == on_device.name
-    expected, found = on_host.describe_many(VIEWS), on_device.describe_many(VIEWS)
+    expected, found = (np.stack([each.describe(it) for it in VIEWS]) for each in (on_host, on_device))
     assert np.linalg.norm(expected - found, axis=1).max() < 0.1 * np.linalg.norm(expected[0] - expected[1])
 
 
@@ -115,9 +115,10 @@ def test_without_flash_attention_it_computes_in_full_precision(file: Path, monke
         raise RuntimeError("no such kernel")
 
     monkeypatch.setattr(blocks, "flash_attention", missing)
-    on_host, on_device = (MegaLocDescriptor(file, device, SMALL_MEGALOC, 24, 3) for device in ("cpu", "cuda"))
+    on_host, on_device = (MegaLocDescriptor(file, device, SMALL_MEGALOC, 24) for device in ("cpu", "cuda"))
     assert on_device.dtype == torch.float32
-    np.testing.assert_allclose(on_device.describe_many(VIEWS), on_host.describe_many(VIEWS), rtol=0, atol=1e-3)
+    for it in VIEWS:
+        np.testing.assert_allclose(on_device.describe(it), on_host.describe(it), rtol=0, atol=1e-3)
 
 
 OPTIONS = NetworkOptions(pixel_limit=PIXEL_LIMIT)

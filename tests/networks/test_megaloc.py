@@ -48,11 +48,11 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def descriptor(file: Path) -> MegaLocDescriptor:
-    return MegaLocDescriptor(file, sizes=SMALL_MEGALOC, dimension=24, batch=3)
+    return MegaLocDescriptor(file, sizes=SMALL_MEGALOC, dimension=24)
 
 
-def some_views(count: int, reads: list[str] | None = None) -> list[View]:
-    return [view_of(photograph(textured(80 + 8 * i, 60, seed=i), reads=reads)) for i in range(count)]
+def some_views(count: int) -> list[View]:
+    return [view_of(photograph(textured(80 + 8 * i, 60, seed=i))) for i in range(count)]
 
 
 # ---- the network
@@ -166,23 +166,6 @@ def test_the_name_has_weights_and_length(file: Path, tmp_path: Path) -> None:
     assert all(name.startswith(("megaloc-24-322px-", "megaloc-96-322px-")) for name in names)
 
 
-def test_a_batch_does_not_change_a_vector(descriptor: MegaLocDescriptor) -> None:
-    """More views than go together, of different shapes; the last batch is smaller."""
-    views = some_views(7)
-    together = descriptor.describe_many(views)
-    np.testing.assert_allclose(together, [descriptor.describe(view) for view in views], rtol=0, atol=1e-6)
-    assert descriptor.describe_many([]).shape == (0, 24)
-
-
-def test_photographs_are_read_one_batch_at_a_time(descriptor: MegaLocDescriptor) -> None:
-    reads: list[str] = []
-    read_before: list[int] = []
-    hook = descriptor._network.register_forward_pre_hook(lambda *_: read_before.append(len(reads)))
-    descriptor.describe_many(some_views(7, reads))
-    hook.remove()
-    assert read_before == [3, 6, 7]
-
-
 @pytest.mark.parametrize("size", [(640, 480), (90, 700), (322, 322), (1, 130)])
 def test_photographs_are_resized_as_published(descriptor: MegaLocDescriptor, size: tuple[int, int]) -> None:
     image = textured(*size, seed=9)
@@ -198,7 +181,7 @@ def test_photographs_are_resized_as_published(descriptor: MegaLocDescriptor, siz
 def test_low_precision_changes_vectors_little(file: Path) -> None:
     views = some_views(4)
     exact, rough = (
-        MegaLocDescriptor(file, sizes=SMALL_MEGALOC, dimension=24, dtype=dtype).describe_many(views)
+        np.stack([MegaLocDescriptor(file, sizes=SMALL_MEGALOC, dimension=24, dtype=dtype).describe(it) for it in views])
         for dtype in (torch.float32, torch.bfloat16)
     )
     assert rough.dtype == np.float32

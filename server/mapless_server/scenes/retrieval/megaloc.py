@@ -9,13 +9,11 @@ eight: 0.42 GB of weights instead of 0.91.
 """
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812  its usual name
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mapless_server.method.features.views import View
@@ -37,9 +35,6 @@ _VERSION = 1
 """Version of the computation; part of the name."""
 DIMENSION = 1056
 """Length of the vectors, a divisor of 8448, the network's own; the module explains this one."""
-BATCH = 16
-"""Photographs that `describe_many` computes together: 8,480 tokens, enough to occupy a device, and about 0.3 GB beside
-the weights by calculation."""
 
 
 class MegaLocDescriptor:
@@ -55,7 +50,7 @@ class MegaLocDescriptor:
         weights: safetensors file, the names of the authors' checkpoint.
         device: "cpu" or a CUDA device.
         sizes: sizes of the network; None for those of the authors' weights.
-        dimension, batch: see `DIMENSION` and `BATCH`.
+        dimension: see `DIMENSION`.
         dtype: None for bfloat16 on a CUDA device with flash attention, else float32. Not part of the name, so that
             servers with and without a GPU can share references: it changes similarities by a thousandth of what they
             differ by among photographs of one scene (random weights).
@@ -73,10 +68,9 @@ class MegaLocDescriptor:
         device: str = "cpu",
         sizes: MegaLocSizes | None = None,
         dimension: int = DIMENSION,
-        batch: int = BATCH,
         dtype: torch.dtype | None = None,
     ) -> None:
-        self._device, self._batch = torch.device(device), batch
+        self._device = torch.device(device)
         self.dtype = dtype or _best_dtype(self._device)
         with torch.device("meta"):
             self._network = MegaLoc(sizes)
@@ -87,26 +81,14 @@ class MegaLocDescriptor:
         self.dimension = self._network.length
         self.name = f"megaloc-{self.dimension}-{SIDE_PX}px-{sha256[:8]}-{_VERSION}"
 
+    @torch.inference_mode()
     def describe(self, view: View) -> Vector:
         """See GlobalDescriptor.describe.
 
         ValueError if the view has no photograph; RequestError if the photograph cannot be read.
         """
-        vector: Vector = self.describe_many([view])[0]
+        vector: Vector = self._network(_picture(view)[None].to(self._device))[0].cpu().numpy()
         return vector
-
-    @torch.inference_mode()
-    def describe_many(self, views: Sequence[View]) -> NDArray[np.float32]:
-        """Computes vectors (N, D) of views in batches, with one photograph in memory at a time.
-
-        Batching changes a vector by rounding only. Errors as in `describe`.
-        """
-        described = np.empty((len(views), self.dimension), np.float32)
-        for begin in range(0, len(views), self._batch):
-            pictures = torch.stack([_picture(view) for view in views[begin : begin + self._batch]])
-            vectors = self._network(pictures.to(self._device))
-            described[begin : begin + len(pictures)] = vectors.cpu().numpy()
-        return described
 
 
 def _picture(view: View) -> Tensor:
