@@ -1,10 +1,10 @@
 """MapAnything (Keetha et al. 2025), version 1.1: metric points, confidence and poses from images and hints.
 
-Any subset of the views may have rays, poses and depths. The first view is the reference: poses are given and predicted
+Any subset of the views may have rays and poses. The first view is the reference: poses are given and predicted
 relative to it, and it must be posed if any is. The network takes given values as hints only, so the output has to be
-aligned with the given poses.
+aligned with the given poses. The official network's part for given depths is left out, since no photograph has any.
 
-    image > DINOv2 ViT-g > + rays, depths      (of each view alone: `encode`, whose result can be cached)
+    image > DINOv2 ViT-g > + rays              (of each view alone: `encode`, whose result can be cached)
                          > + poses, normalize  > blocks over the scene and within views in turn
                                                > points, poses, scale of the scene (`decode`)
 
@@ -26,11 +26,9 @@ from .heads import DenseFeatures, DenseRegression, ResidualMlp
 from .network import IMAGE_MEAN, IMAGE_STD, Network, NetworkOutput
 from .view_conditions import (
     MIN_LENGTH,
-    GivenMaps,
     MapEncoder,
     RelativePoses,
     VectorEncoder,
-    normalize_depths,
     pinhole_rays,
     quaternions_from_rotations,
     relative_poses,
@@ -43,6 +41,9 @@ DENSE_VIEWS = 5
 """Views whose pixels are computed at a time: each takes 0.35 GB at 518x392."""
 HIDDEN_LOGIT = -1e4
 """The confidence's logit where the network masks a pixel: its sigmoid is 0."""
+
+UNUSED = ("depth_encoder.", "depth_scale_encoder.")
+"""Prefixes of names in the checkpoint that are not used here: for given depths."""
 
 V1_WIDTH = 768
 """Channels of a token in version 1 of the network."""
@@ -78,7 +79,7 @@ class MapAnythingSizes:
         encoder_heads, encoder_depth: heads and blocks of the encoder.
         heads, depth: heads and (an even number of) blocks of the transformer over all views.
         taps: two blocks of it whose output the dense head gets, besides its input and its last output.
-        map_widths, vector_widths: channels in the encoders of rays and depths, and of poses and scales.
+        map_widths, vector_widths: channels in the encoders of rays, and of poses and scales.
         dense_map_widths, dense_width, dense_hidden: channels of the dense head.
         pose_width, scale_width: channels of the other heads.
     """
@@ -127,7 +128,7 @@ class MapAnything(Network):
     conditioned = True
     metre_sigma = 0.2
     """A third party found a mean error of the scale of 16 % on ETH3D, for a normal distribution 0.8 of this."""
-    file_names = FileNames(canonical_name, describe_misfit=_describe_misfit)
+    file_names = FileNames(canonical_name, UNUSED, _describe_misfit)
     image_mean: Tensor
     image_std: Tensor
 
@@ -143,8 +144,6 @@ class MapAnything(Network):
         encoder = PlainEncoder(width, sizes.encoder_heads, sizes.encoder_depth, gated=True)
         self.encoder = nn.ModuleDict({"model": encoder})
         self.ray_dirs_encoder = MapEncoder(3, sizes.map_widths, width)
-        self.depth_encoder = MapEncoder(1, sizes.map_widths, width)
-        self.depth_scale_encoder = VectorEncoder(1, sizes.vector_widths, width)
         self.cam_rot_encoder = VectorEncoder(4, sizes.vector_widths, width)
         self.cam_trans_encoder = VectorEncoder(3, sizes.vector_widths, width)
         self.cam_trans_scale_encoder = VectorEncoder(1, sizes.vector_widths, width)
@@ -177,25 +176,18 @@ class MapAnything(Network):
         shift = intrinsics.new_zeros(3, 3)
         shift[:2, 2] = 0.5
         rays = pinhole_rays(intrinsics - shift, layout[0] * PATCH_PX, layout[1] * PATCH_PX)
-        return self.encode_views(images, GivenMaps(rays, rays.new_ones(len(rays), dtype=torch.bool)))
+        return self.encode_views(images, rays)
 
-    def encode_views(self, images: Tensor, given: GivenMaps | None = None) -> Tensor:
-        """Tokens (V, P + 1, C) float32 of each view alone, the class token last, from images (V, 3, H, W) in [0, 1]."""
+    def encode_views(self, images: Tensor, rays: Tensor | None = None) -> Tensor:
+        """Tokens (V, P + 1, C) float32 of each view alone, the class token last.
+
+        Images are (V, 3, H, W) in [0, 1], rays (V, H, W, 3) unit directions in the camera's frame, of any kind of lens.
+        """
         encoded = self.encoder["model"]((images - self.image_mean) / self.image_std)
         of_class, patches = encoded.split([1, encoded.shape[1] - 1], dim=1)
-        if given is not None:
-            patches = patches + self._features_of(given)
+        if rays is not None:
+            patches = patches + self.ray_dirs_encoder(rays.permute(0, 3, 1, 2))
         return torch.cat([patches, of_class], dim=1)
-
-    def _features_of(self, given: GivenMaps) -> Tensor:
-        """Features (V, P, C) of the given maps; 0 where nothing is given."""
-        features = _where(given.has_rays, self.ray_dirs_encoder(given.rays.permute(0, 3, 1, 2)))
-        if given.depths is None or given.has_depth is None or given.is_metric is None:
-            return features
-        normalized, scale = normalize_depths(given.depths)
-        features = features + _where(given.has_depth, self.depth_encoder(normalized[:, None]))
-        of_scale = self.depth_scale_encoder((scale + MIN_LENGTH).log()[:, None])[:, None]
-        return features + _where(given.has_depth & given.is_metric, of_scale)
 
     def conditions(self, poses: Tensor, posed: Tensor, metric: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
         """See Network.conditions; returns the arguments unchanged, since scenes may differ in which views are posed.

@@ -1,7 +1,7 @@
 """The conditions of MapAnything: what is known of some views besides images, as features added to patches.
 
-Rays, depths and poses may each be given for any subset of the views. Rays and depths concern one view alone; poses are
-relative to view 0, and their translations are divided by a common length, which is given apart, if it is metric.
+Rays and poses may each be given for any subset of the views. Rays concern one view alone; poses are relative to view 0,
+and their translations are divided by a common length, which is given apart, if it is metric.
 
 The encoders compute in float32, also where the transformer does not.
 """
@@ -19,25 +19,6 @@ from .encoder import PATCH_PX
 
 MIN_LENGTH = 1e-8
 """Lengths and scales are not smaller; also added to logarithms' arguments."""
-
-
-@dataclass(frozen=True, eq=False)
-class GivenMaps:
-    """Rays and depths of V views, for each pixel.
-
-    Attributes:
-        rays: (V, H, W, 3) unit directions in the camera's frame, for any kind of lens.
-        has_rays: (V,) bool; the values of other views have no effect.
-        depths: (V, H, W) distances along the rays, 0 where unknown; None if no view has any.
-        has_depth: (V,) bool; needs the view's rays.
-        is_metric: (V,) bool, whether the view's depths are in metres.
-    """
-
-    rays: Tensor
-    has_rays: Tensor
-    depths: Tensor | None = None
-    has_depth: Tensor | None = None
-    is_metric: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +48,6 @@ def pinhole_rays(intrinsics: Tensor, height_px: int, width_px: int) -> Tensor:
 def _focal_and_principal(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
     """Focal lengths and principal points, (V, 2) each, x and y."""
     return intrinsics[:, :2, :2].diagonal(dim1=1, dim2=2), intrinsics[:, :2, 2]
-
-
-def normalize_depths(depths: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns log(1 + depth / s) of depths (V, H, W), with holes 0; and s (V,), the mean depth above 0 of each view."""
-    known = depths > 0
-    total = torch.where(known, depths, 0.0).sum((1, 2))
-    scale = (total / known.sum((1, 2)).clamp_min(1)).clamp_min(MIN_LENGTH)
-    return torch.where(known, torch.log1p(depths / scale[:, None, None]), 0.0), scale
 
 
 def quaternions_from_rotations(rotations: Tensor) -> Tensor:
