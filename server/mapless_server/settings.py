@@ -82,8 +82,6 @@ class Settings(BaseModel):
     """Depth kept with references, for the backend geometric: off, stored (others make it), or the network that does."""
     compiled_views: int = Field(default=0, ge=0, le=65)
     """Photographs of a query, itself included, that a network is compiled for at the start, at least 3; 0: none."""
-    query_rays: bool = True
-    """Whether pi3x and mapanything get the photograph's own intrinsics; they always get those of the references."""
     workers: int = Field(default_factory=available_cores, ge=1)
     """Threads that compute."""
     max_batch: int = Field(default=4, ge=1, le=64)
@@ -254,6 +252,8 @@ _PLAIN_BOUNDS = {
 _BOUNDS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 _PASSWORD = re.compile(r"(:/+[^/@:]*:).+(?=@)", re.DOTALL)
 """In a URL; a path has only one slash of its two. An @ and a line break may be in the password."""
+_REMOVED = {"query_rays": "networks that take intrinsics always get the photograph's own; leave it out"}
+"""Former settings, and what to do instead."""
 _COMPUTED_DEFAULTS = {"workers": "all cores", "weights_dir": "~/.cache/mapless/weights"}
 
 
@@ -360,6 +360,8 @@ def _read_environment() -> dict[str, str]:
 
 
 def _unknown(origin: str, name: str, known: Iterable[str]) -> str:
+    if (known_once := name.lower().removeprefix(PREFIX.lower())) in _REMOVED:
+        return f"{origin}: {name} is no setting any more: {_REMOVED[known_once]}"
     nearest = difflib.get_close_matches(name.upper() if origin == "environment" else name.lower(), known, 1)
     suggestion = f"; did you mean {nearest[0]}?" if nearest else ""
     return f"{origin}: {ascii(name)[1:-1]} is not a setting{suggestion}"

@@ -71,6 +71,7 @@ def test_the_file_may_be_named_by_the_environment(config: Path, monkeypatch: pyt
     ("text", "expected"),
     [
         ("featurs = 1", "file: featurs is not a setting; did you mean features?"),
+        ("query_rays = false", "file: query_rays is no setting any more: networks that take intrinsics always get"),
         ("[server]\nport = 1", "file: server is not a setting; settings are given without tables"),
         ("port = 65536", "port (file): must be at most 65535, is 65536"),
         ("port = [", "mapless.toml"),

@@ -255,7 +255,6 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
         settings.weights_dir,
         device,
         compiled_views=settings.compiled_views,
-        query_rays=settings.query_rays,
     )
     uses_depths = settings.reference_depth != OFF and reconstructor.uses_correspondences
     return tuple(

@@ -26,7 +26,6 @@ from support.grey_network import (
     assert_same_bits,
     grey_backend,
     grey_request,
-    greys_of,
 )
 from support.images import textured
 from support.parity_rule import SMALL_MAPANYTHING, SMALL_PI3
@@ -258,28 +257,20 @@ def test_the_unit_of_poses_is_the_metre_as_the_scene_says() -> None:
     assert single.tolist() == [[False, False]]
 
 
-def test_the_querys_rays_are_left_out_by_option() -> None:
-    """Also where the photograph is that of a reference, whose tokens are others then."""
+def test_a_conditioned_network_gets_the_rays_of_every_view() -> None:
     runner = GreyRunner(conditioned=True)
-    references = grey_request(1, 50, 60)[1]
-    query = references[0].view
-    for query_rays, expected in ((True, [True, True]), (False, [True, True, False])):
-        runner.has_rays.clear()
-        options = replace(OPTIONS, query_rays=query_rays)
-        assert greys_of(reconstruct_one(grey_backend(runner, options), query, references)) == [50, 50, 60]
-        assert runner.has_rays == expected
+    reconstruct_one(grey_backend(runner, OPTIONS), *grey_request(1, 50, 60))
+    assert runner.has_rays == [True, True, True]
 
 
 @pytest.mark.parametrize("name", ["pi3x", "mapanything"])
-def test_poses_and_rays_of_a_conditioned_network_have_an_effect(name: str) -> None:
+def test_poses_of_a_conditioned_network_have_an_effect(name: str) -> None:
     query, references = small_request(3)
     runner = small_runner(name)
     plain = reconstruct_one(NetworkReconstructor(runner, OPTIONS), query, references)
-    without_rays = reconstruct_one(NetworkReconstructor(runner, replace(OPTIONS, query_rays=False)), query, references)
     turned = [replace(it, world_from_camera=pose) for it, pose in zip(references, random_poses(3), strict=True)]
     other_poses = reconstruct_one(NetworkReconstructor(runner, OPTIONS), query, turned)
-    for other in (without_rays, other_poses):
-        assert np.abs(arrays_of(other)[0] - arrays_of(plain)[0]).max() > 1e-3
+    assert np.abs(arrays_of(other_poses)[0] - arrays_of(plain)[0]).max() > 1e-3
 
 
 @pytest.mark.parametrize("name", ["pi3x", "mapanything"])

@@ -6,7 +6,6 @@ A further network needs its name in `choices.NETWORKS` and an entry, with its cl
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,15 +30,14 @@ def make_reconstructor(
     device: str = "cpu",
     options: NetworkOptions | None = None,
     compiled_views: int = 0,
-    query_rays: bool = True,
     answers_queries: bool = True,
 ) -> Reconstructor:
     """Makes the backend that a setting names: one of `BACKENDS`, or `auto`, on "cpu" or a CUDA device.
 
     `auto` is a network if its weights are in the folder and there is a CUDA device; otherwise it is `geometric`, and
     the reason is logged. A network is compiled for photographs of 4:3, landscape or portrait, with `compiled_views`,
-    the query included, which takes minutes; 0 compiles nothing. For `query_rays` see NetworkOptions; `answers_queries`
-    says whether queries wait for it, so that a CPU is worth a warning.
+    the query included, which takes minutes; 0 compiles nothing. `answers_queries` says whether queries wait for it, so
+    that a CPU is worth a warning.
 
     ValueError for an unknown name; WeightsMissing if the network's weights are not in the folder, with the command that
     fetches them; CheckpointError if they do not fit the network; ImportError if a package that networks need is not
@@ -53,7 +51,7 @@ def make_reconstructor(
         return GeometricReconstructor()
     if device == "cpu" and answers_queries:
         log.warning("backend %s on the CPU: minutes for a query, so calls need longer deadlines", backend)
-    return _load(backend, find_weights(backend, weights_dir), device, options, compiled_views, query_rays)
+    return _load(backend, find_weights(backend, weights_dir), device, options, compiled_views)
 
 
 def _choose(weights_dir: Path, device: str) -> str:
@@ -85,7 +83,6 @@ def _load(
     device: str,
     options: NetworkOptions | None,
     compiled_views: int,
-    query_rays: bool,
 ) -> Reconstructor:
     import torch
 
@@ -95,7 +92,7 @@ def _load(
     from .grids import fitted_grid
     from .network import NetworkOptions, NetworkReconstructor
 
-    options = replace(options or NetworkOptions(), query_rays=query_rays)
+    options = options or NetworkOptions()
     known = named(backend)
     with torch.device("meta"):
         network = known.network_class()()

@@ -44,13 +44,10 @@ class NetworkOptions:
     Attributes:
         pixel_limit: largest number of pixels of a picture.
         cache: tokens of references.
-        query_rays: whether a network that takes intrinsics gets the query's. MapAnything saw few views without a pose
-            among posed ones when it was trained, with intrinsics or without: not measured.
     """
 
     pixel_limit: int = PIXEL_LIMIT
     cache: TokenCacheOptions = field(default_factory=TokenCacheOptions)
-    query_rays: bool = True
 
     def __post_init__(self) -> None:
         check_bounds(self, "pixel_limit", at_least=PATCH_PX**2)
@@ -175,7 +172,7 @@ class NetworkReconstructor:
         """Computes the tokens (T, C) of a view."""
         picture = torch.from_numpy(view.layout.picture(view.photograph.read()))
         intrinsics = None
-        if self._runner.conditioned and view.given_rays:
+        if self._runner.conditioned:
             intrinsics = torch.from_numpy(view.layout.intrinsics.astype(np.float32))[None]
         return self._runner.encode(_on_device(picture[None], self._runner.device), intrinsics)[0]
 
@@ -188,7 +185,7 @@ class NetworkReconstructor:
             photograph.sha256,
             photograph.camera,
             layout.grid,
-            layout.camera if view.given_rays else None,
+            layout.camera,
         )
 
     def _outcome(self, scene: _Scene, output: NetworkOutput, index: int) -> Outcome:
@@ -217,11 +214,10 @@ class NetworkReconstructor:
 
 @dataclass(frozen=True, eq=False)
 class _LaidOut:
-    """A view's photograph, its layout on the scene's grid, and whether a network may be given its intrinsics."""
+    """A view's photograph, and its layout on the scene's grid."""
 
     photograph: Photograph
     layout: Layout
-    given_rays: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,10 +239,9 @@ class _Scene:
         references = [_photograph(reference.view, reference.name) for reference in request.references]
         query = _photograph(request.query, "the query")
         grid = common_grid([photograph.camera for photograph in references], options.pixel_limit)
-        given_rays = [True] * len(references) + [options.query_rays]
         views = (
-            _LaidOut(photograph, lay_out(photograph.camera, grid, options.pixel_limit), given)
-            for photograph, given in zip([*references, query], given_rays, strict=True)
+            _LaidOut(photograph, lay_out(photograph.camera, grid, options.pixel_limit))
+            for photograph in (*references, query)
         )
         return cls(grid, request.references, tuple(views), request.is_metric)
 

@@ -21,7 +21,7 @@ from .grids import Grid
 class TokenKey:
     """Everything that the tokens of a view depend on: computation, encoded photograph and its camera, and picture.
 
-    `camera` is the picture's, for a network that takes intrinsics; None if it is not given to the network.
+    `camera` is the picture's, which a network that takes intrinsics gets.
     """
 
     network: str
@@ -30,7 +30,7 @@ class TokenKey:
     image_sha256: str
     source: Camera
     grid: Grid
-    camera: Camera | None
+    camera: Camera
 
 
 @dataclass(frozen=True)
