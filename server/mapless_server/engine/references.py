@@ -3,10 +3,9 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from mapless.names import reference_name
 from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import Description, Photo
-from mapless_server.errors import DataLoss, InvalidArgument, NotFound
+from mapless_server.errors import DataLoss, InvalidArgument
 from mapless_server.images import ImageLimits
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.options import StageContext
@@ -16,8 +15,9 @@ from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.retrieval.index import GlobalDescriptor
 from mapless_server.scenes.retrieval.ranking import nearest_references
 from mapless_server.scenes.scene_agreements import SceneAgreements
-from mapless_server.security import SceneKey, scene_id_of
+from mapless_server.security import SceneKey
 from mapless_server.store import SceneAttributes
+from mapless_server.store.queries import reference_not_found
 
 from .query import POSE_PRIOR
 
@@ -92,10 +92,7 @@ class References:
                 if main.indexes.is_damaged(scene_key, reference_id):
                     message = f"reference {reference_id!r} is damaged in the store: delete it and add it again"
                     raise DataLoss(message, field=f"references[{index}]")
-                scene_id = scene_id_of(scene_key)
-                message = f"there is no reference {reference_id!r} in scene {scene_id!r}"
-                name = reference_name(scene_id, reference_id)
-                raise NotFound(message, field=f"references[{index}]", resource=name)
+                raise reference_not_found(scene_key, reference_id, f"references[{index}]")
         if not len(entries):
             return Choice((), "", entries.generation)
         if own is not main:

@@ -10,7 +10,15 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 
-from prometheus_client import Counter, Gauge, GCCollector, Histogram, PlatformCollector
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    GCCollector,
+    Histogram,
+    PlatformCollector,
+    disable_created_metrics,
+)
 from prometheus_client import ProcessCollector as ProcessMetrics
 
 from mapless.v1 import localization_service_pb2, reference_service_pb2
@@ -32,7 +40,7 @@ from .buckets import (
     WAIT_BUCKETS,
 )
 from .scraped import Scraped
-from .series import OTHER, Children, Registry
+from .series import OTHER, Children
 
 STAGES = ("prepare", "coarse", "refine", "join", "describe", "retrieve", "audit", "coverage")
 """Stages of the queue."""
@@ -96,7 +104,8 @@ class Metrics(Observer, BackgroundObserver):
     """
 
     def __init__(self) -> None:
-        self.registry = Registry()
+        disable_created_metrics()  # which would double the number of series
+        self.registry = CollectorRegistry()
         ProcessMetrics(registry=self.registry)
         PlatformCollector(registry=self.registry)
         GCCollector(registry=self.registry)

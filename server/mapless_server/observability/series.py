@@ -1,11 +1,9 @@
-"""Series of metrics: limited in number, without the times of their creation."""
+"""Series of metrics, limited in number."""
 
 from collections.abc import Iterable
 from typing import Generic, TypeVar
 
-from prometheus_client import CollectorRegistry
 from prometheus_client.metrics import MetricWrapperBase
-from prometheus_client.metrics_core import Metric
 
 OTHER = "other"
 MAX_CHILDREN = 64
@@ -13,16 +11,6 @@ MAX_CHILDREN = 64
 references and size of image: further ones are counted together, as "other"."""
 
 M = TypeVar("M", bound=MetricWrapperBase)
-
-
-class Registry(CollectorRegistry):
-    """A registry without the creation times of series, which would double their number."""
-
-    def collect(self) -> Iterable[Metric]:
-        """Implements Collector."""
-        for family in super().collect():
-            family.samples = [sample for sample in family.samples if not sample.name.endswith("_created")]
-            yield family
 
 
 class Children(Generic[M]):
