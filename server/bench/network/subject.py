@@ -83,14 +83,13 @@ class Work:
     """One forward pass of a scene.
 
     Of its views, so many are encoded, the tokens of the others being given, and points and confidence of so many are
-    computed; or the last view's pose alone (`query_only`), which only MapAnything can.
+    computed.
     """
 
     encoded: int
     mapped: int
     views: int = REFERENCES + 1
     grid: tuple[int, int] = GRID
-    query_only: bool = False
 
 
 class Scene:
@@ -123,11 +122,6 @@ class Scene:
         """Reconstructs the scene from tokens (1, N, T, C)."""
         return network.reconstruct(tokens, self.layout, mapped, *self.conditions)
 
-    def query_pose(self, network: Network, tokens: Tensor) -> Tensor:
-        """The pose of the last view alone, which only MapAnything can compute alone."""
-        assert isinstance(network, MapAnything)
-        return network.query_pose(tokens, self.layout, *self.conditions)
-
 
 def flop_of(name: str, work: Work, sizes: AnySizes | None = None) -> int:
     """Counts the operations that a forward pass executes."""
@@ -136,8 +130,6 @@ def flop_of(name: str, work: Work, sizes: AnySizes | None = None) -> int:
     shape = (1, work.views, network.token_count(work.grid), network.width)
     tokens = torch.empty(shape, dtype=torch.bfloat16, device="meta")
     encoded = count_flop(lambda: scene.encode(network, slice(work.encoded))) if work.encoded else 0
-    if work.query_only:
-        return encoded + count_flop(lambda: scene.query_pose(network, tokens))
     return encoded + count_flop(lambda: scene.reconstruct(network, tokens, work.mapped))
 
 
@@ -153,7 +145,6 @@ WORKS = {
     "references mapped": Work(VIEWS, REFERENCES),
     "references' tokens kept, references mapped": Work(1, REFERENCES),
     "references' tokens kept, cameras only": Work(1, 0),
-    "references' tokens kept, the query's camera only": Work(1, 0, query_only=True),
 }
 
 
@@ -162,9 +153,8 @@ def count_all(peak: Peak) -> Iterator[Figure]:
     for name in NETWORKS:
         part = f"{name}, {VIEWS} views of 518x392; floors are those of {peak.device}"
         for label, work in WORKS.items():
-            if name == "mapanything" or not work.query_only:
-                flop = flop_of(name, work)
-                yield Figure(part, label, flop / 1e12, "TFLOP", floor_ms=peak.floor_ms(flop))
+            flop = flop_of(name, work)
+            yield Figure(part, label, flop / 1e12, "TFLOP", floor_ms=peak.floor_ms(flop))
         network = meta_network(name)
         weights = sum(it.nbytes for it in network.parameters())
         tokens = CACHED * network.token_count(GRID) * network.width * torch.bfloat16.itemsize

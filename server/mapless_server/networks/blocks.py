@@ -148,16 +148,6 @@ class Attention(nn.Module):
             q, k = rope.rotate(q), rope.rotate(k)
         return self.merge(self.attend(q, k, v))
 
-    def of_last(self, x: Tensor, count: int) -> Tensor:
-        """The output (B, count, C) of the last `count` tokens of (B, T, C), without rotation."""
-        width = x.shape[-1]
-        weight, bias = self.qkv.weight, self.qkv.bias
-        q = F.linear(x[:, -count:].to(weight.dtype), weight[:width], bias[:width])
-        kv = F.linear(x.to(weight.dtype), weight[width:], bias[width:])
-        k, v = kv.unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
-        q = q.unflatten(-1, (self.heads, -1)).transpose(1, 2)
-        return self.merge(self.attend(self.q_norm(q), self.k_norm(k), v))
-
 
 class Block(nn.Module):
     """A transformer block, normalized before attention and before the MLP."""
@@ -178,8 +168,3 @@ class Block(nn.Module):
         """Tokens (B, T, C) to (B, T, C); tokens of one row of the batch attend to each other."""
         x = x + self.ls1(self.attn(self.norm1(x), rope))
         return x + self.ls2(self.mlp(self.norm2(x)))
-
-    def of_last(self, x: Tensor, count: int) -> Tensor:
-        """The output (B, count, C) of the last `count` tokens of (B, T, C), without rotation."""
-        last = x[:, -count:] + self.ls1(self.attn.of_last(self.norm1(x), count))
-        return last + self.ls2(self.mlp(self.norm2(last)))

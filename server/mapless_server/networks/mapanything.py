@@ -108,8 +108,8 @@ class Decoded:
         depths: (B, M, H, W) distances along the rays.
         confidence_logits: (B, M, H, W); the official confidence is 1 + their exponential.
         mask_logits: (B, M, H, W); above 0 where the pixel shows a surface.
-        translations: (B, N, 3) camera centres of the last N views, whose poses are computed.
-        quaternions: (B, N, 4) rotations of the same, x, y, z, w, unit length, world_from_camera.
+        translations: (B, N, 3) camera centres.
+        quaternions: (B, N, 4) rotations, x, y, z, w, unit length, world_from_camera.
         scale: (B, 1) metres per unit.
     """
 
@@ -210,21 +210,6 @@ class MapAnything(Network):
         """See Network.reconstruct; the output is metric, within the network's accuracy."""
         return as_output(self.decode(tokens, layout, mapped, _relative(poses, posed), posed, metric))
 
-    def query_pose(
-        self,
-        tokens: Tensor,
-        layout: tuple[int, int],
-        poses: Tensor | None = None,
-        posed: Tensor | None = None,
-        metric: Tensor | None = None,
-    ) -> Tensor:
-        """The pose (B, 1, 4, 4) of the last view of each scene alone, the same as that of `reconstruct`.
-
-        The last block over the scene computes the rows of that view only, and the block after it that view only.
-        """
-        decoded = self.decode(tokens, layout, 0, _relative(poses, posed), posed, metric, last_pose_only=True)
-        return as_output(decoded).camera_poses
-
     def decode(
         self,
         tokens: Tensor,
@@ -233,8 +218,6 @@ class MapAnything(Network):
         relative: RelativePoses | None = None,
         posed: Tensor | None = None,
         metric: Tensor | None = None,
-        *,
-        last_pose_only: bool = False,
     ) -> Decoded:
         """Computes the network's output from tokens (B, N, T, C) of `encode_views`.
 
@@ -245,7 +228,6 @@ class MapAnything(Network):
             relative: relative poses; None if none is known.
             posed: (B, N) bool, which views have a pose.
             metric: (B, N) bool, whether a view's pose is in metres; None if all are.
-            last_pose_only: whether only the last view's pose is computed; `mapped` must then be 0.
         """
         tokens = tokens.to(self.scale_token.dtype)
         patches, of_class = tokens.split([tokens.shape[2] - 1, 1], dim=2)
@@ -253,7 +235,7 @@ class MapAnything(Network):
             patches = patches + self._features_of_poses(relative, posed, metric)[:, :, None]
         fused = self.fusion_norm_layer(patches)
         joined = torch.cat([fused, of_class], dim=2)
-        taps, last, scale = self.info_sharing(joined, self.scale_token, 1 if last_pose_only else tokens.shape[1])
+        taps, last, scale = self.info_sharing(joined, self.scale_token)
         dense = self._dense([fused, *(tap[:, :, :-1] for tap in taps), last[:, :, :-1]], mapped, layout)
         rays, log_depth, confidence, mask = dense.split([3, 1, 1, 1], dim=2)
         translations, quaternions = self.pose_head(last[:, :, :-1])
@@ -300,13 +282,13 @@ class ViewTransformer(nn.Module):
         self.self_attention_blocks = nn.ModuleList(Block(width, heads, gated=True) for _ in range(depth))
         self.norm = LayerNorm(width, eps=BLOCK_EPS)
 
-    def forward(self, tokens: Tensor, scale_token: Tensor, kept: int) -> tuple[list[Tensor], Tensor, Tensor]:
+    def forward(self, tokens: Tensor, scale_token: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
         """Transforms the tokens (B, N, T, C) of all views of B scenes, and the learned scale token (C,).
 
-        Returns the normalized output (B, N, T, C) of the two blocks at the taps; of the last block (B, kept, T, C); and
-        that of the scale token (B, C). The last two blocks are computed for the last `kept` views.
+        Returns the normalized output (B, N, T, C) of the two blocks at the taps and of the last block, and that of the
+        scale token (B, C).
         """
-        scenes, views, count, width = tokens.shape
+        scenes, _, count, width = tokens.shape
         x = torch.cat([tokens[:, :1] + self.view_pos_table, tokens[:, 1:]], dim=1)
         scale = scale_token.expand(scenes, 1, width)
         tapped = []
@@ -314,13 +296,7 @@ class ViewTransformer(nn.Module):
             if index % 2 == 1:
                 x = block(x.flatten(0, 1)).unflatten(0, (scenes, -1))
             else:
-                joined = torch.cat([x.flatten(1, 2), scale], dim=1)
-                is_last = index + 2 == len(self.self_attention_blocks)
-                if is_last and kept < views:
-                    assert isinstance(block, Block)
-                    joined = block.of_last(joined, kept * count + 1)
-                else:
-                    joined = block(joined)
+                joined = block(torch.cat([x.flatten(1, 2), scale], dim=1))
                 x, scale = joined[:, :-1].unflatten(1, (-1, count)), joined[:, -1:]
             if index in self.taps:
                 tapped.append(self.norm(x))
