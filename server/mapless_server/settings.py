@@ -3,12 +3,12 @@
 import difflib
 import os
 import re
-import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
+import tomllib
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -21,11 +21,6 @@ from pydantic import (
 )
 
 from mapless_server.choices import AUTO, BACKENDS, BEST_VARIANTS, FEATURES, NETWORKS, OFF, STORED
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 PREFIX = "MAPLESS_"
 CONFIG_VARIABLE = "MAPLESS_CONFIG"

@@ -156,8 +156,7 @@ class _HttpServer(socketserver.ThreadingMixIn, WSGIServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Overrides BaseServer's: logs the error, unless the client broke the connection."""
-        error = sys.exception() if sys.version_info >= (3, 11) else sys.exc_info()[1]
-        if not isinstance(error, OSError):
+        if not isinstance(error := sys.exception(), OSError):
             log.warning("a request for metrics failed", exc_info=error)
 
 

@@ -313,7 +313,7 @@ class CallGuard:
         """Returns the answer, or raises DeadlineExceeded at the deadline, however long the servicer takes to stop.
 
         asyncio.wait_for cannot be used: before Python 3.12 it loses a cancellation that comes together with the answer.
-        asyncio.timeout is missing in Python 3.10. Both would wait for the servicer.
+        Both it and asyncio.timeout would wait for the servicer.
         """
         remaining_s = deadline_s - time.monotonic()
         if remaining_s > 0:

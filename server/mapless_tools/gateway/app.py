@@ -50,7 +50,7 @@ class GatewayOptions:
     guard: GuardOptions = field(default_factory=GuardOptions)
 
 
-def gateway(connect: Callable[[], Client], options: GatewayOptions, rpc: ASGIApp | None = None) -> ASGIApp:
+def gateway(connect: Callable[[], Client], options: GatewayOptions, rpc: ASGIApp) -> ASGIApp:
     """Makes the application.
 
     `connect` makes the client, and is called when the event loop runs. `rpc` is the application for browsers' calls, at
@@ -65,9 +65,8 @@ def gateway(connect: Callable[[], Client], options: GatewayOptions, rpc: ASGIApp
         Route("/v1/localize", handlers.localize, methods=["POST"]),
         Route("/openapi.json", handlers.description, methods=["GET"]),
         Route("/docs", handlers.page, methods=["GET"]),
+        *(Mount(f"/mapless.v1.{service}", rpc) for service in ("LocalizationService", "ReferenceService")),
     ]
-    if rpc is not None:
-        routes += [Mount(f"/mapless.v1.{service}", rpc) for service in ("LocalizationService", "ReferenceService")]
     if options.pages is not None:
         routes.append(Mount("/", StaticFiles(directory=options.pages, html=True)))
     cors = Middleware(

@@ -6,7 +6,6 @@ import socket
 import sys
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from mapless_server.security import is_loopback
 
 from .app import GatewayOptions, gateway
 from .client import ServerClient
+from .rpc import rpc_application
 
 _GRACE_S = 10
 REQUEST_LIMIT_S = 15.0
@@ -116,13 +116,7 @@ def run(server: str, connect: ConnectOptions, options: GatewayOptions, binding: 
     raise_limit()
     # Its callers have the limit of time; the server may start after it.
     connect = replace(connect, connect_timeout_s=math.inf)
-    rpc = None
-    if find_spec("connectrpc") is not None:
-        from .rpc import rpc_application
-
-        rpc = rpc_application(lambda: ServerClient(server, connect), options.guard.max_body_bytes)
-    else:
-        print("gRPC-Web is not served: connectrpc is not installed, which needs Python 3.11", file=sys.stderr)
+    rpc = rpc_application(lambda: ServerClient(server, connect), options.guard.max_body_bytes)
     application = gateway(lambda: ServerClient(server, connect), options, rpc)
     host, is_v6 = binding.host, ":" in binding.host
     family = socket.AF_INET6 if is_v6 else socket.AF_INET
