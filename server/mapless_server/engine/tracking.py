@@ -20,12 +20,12 @@ import numpy as np
 
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.coarse.geometric import GeometricReconstructor
+from mapless_server.method.features.limits import EPIPOLAR_PX
 from mapless_server.method.features.views import PosedView, View
 from mapless_server.method.judge.hypothesis import Doubt, Found, Hypothesis
 from mapless_server.method.options import DoubtOptions
 from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.epipolar import epipolar_distance_px
-from mapless_server.method.pose.two_view_matches import EPIPOLAR_PX
 from mapless_server.scenes import Choice, RankedReference
 
 from .query import Tier

@@ -10,6 +10,7 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, Support
+from mapless_server.method.features.limits import LOSS_SCALE_PX
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge import evidence as halves_of
 from mapless_server.method.judge import judge as judging
@@ -28,7 +29,7 @@ from mapless_server.method.judge.evidence import (
 from mapless_server.method.judge.judge import JudgeOptions, judge, trust_of
 from mapless_server.method.optim.optimize import pose_jacobian
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pose.pnp import LOSS_SCALE_PX, PnpOptions, solve_pose
+from mapless_server.method.pose.pnp import PnpOptions, solve_pose
 from mapless_server.method.rejection import Rejection, RejectionReason
 
 OPTIONS = JudgeOptions()

@@ -397,7 +397,7 @@ def test_what_determines_matches_is_in_their_name() -> None:
     usual = CorrespondOptions()
     changed = [
         replace(usual, **{name: getattr(usual, name) * 0.99})
-        for name in ("reference_ratio", "epipolar_px", "wide_ratio", "wide_similarity")
+        for name in ("reference_ratio", "epipolar_px", "distinct_ratio", "wide_similarity")
     ]
     names = {Matcher(options).pairs.name(kind) for options in (usual, *changed) for kind in TWO}
     assert len(names) == 5 + 3  # strict matches do not depend on the options of wide ones

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 
+from ..features.limits import INLIER_PX
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import MinimizeOptions, columns, minimize
 from ..structure.model import PointMatches, Structure
@@ -99,7 +100,7 @@ class AdjustOptions:
 
     loss_scale_sigma: float = 1.4
     error_inflation: float = 2.0
-    inlier_px: float = 4.0
+    inlier_px: float = INLIER_PX
     min_kept_share: float = 0.8
     max_error_px: float = 8.0
     iterations: int = 8

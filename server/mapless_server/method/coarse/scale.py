@@ -19,7 +19,7 @@ from ..features.tracks import keypoint_offsets
 from ..features.views import PosedView, Reconstruction
 from ..options import ScaleStrategy
 from ..pairs.correspond import Correspondences
-from ..pairs.epipolar import triangulate_depths
+from ..pairs.epipolar import MIN_PARALLAX_DEG, triangulate_depths
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import MetricScale, ScaleStage, Structure
 from ..structure.observations import keypoint_depths, keypoint_rays
@@ -27,10 +27,6 @@ from ..structure.observations import keypoint_depths, keypoint_rays
 MIN_BASELINE_M, MAX_BASELINE_M = 0.3, 10.0
 """Baselines of pairs of references to triangulate, as in the paper. Shorter ones do not determine depth, longer ones
 share few points."""
-
-MIN_PARALLAX_DEG = 1.0
-"""Least angle between the two rays of a triangulated match. It gives a depth to 7 % with errors of a pixel at a focal
-length of 800 px. The paper bounds the baseline alone, but 0.3 m does not determine a depth of 100 m."""
 
 MIN_RATIOS = 24
 """Fewest depth ratios, two per match, for stage 1: their median errs by 1.25 / sqrt(12) of the spread of 12 matches."""

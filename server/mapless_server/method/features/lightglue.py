@@ -11,6 +11,7 @@ from mapless.geometry import Camera
 from mapless_server.bounds import check_bounds
 from mapless_server.networks.lightglue import LightGlue
 
+from .limits import MAX_KEYPOINTS
 from .views import Features, Matches, PosedView, View
 
 NOTHING: Matches = np.empty((0, 2), np.int32)
@@ -29,7 +30,7 @@ class LightGlueOptions:
     """
 
     min_score: float = 0.1
-    max_keypoints: int = 2048
+    max_keypoints: int = MAX_KEYPOINTS
     pairs_at_once: int = 32
     half: bool = False
 
@@ -41,7 +42,7 @@ class LightGlueOptions:
 CONFIDENCES = 0.95, 0.99
 """The authors' depth and width confidence, see `LightGlue.match_one`: 97 % of the matches in half the time."""
 
-CPU_OPTIONS = LightGlueOptions(max_keypoints=1024, pairs_at_once=1)
+CPU_OPTIONS = LightGlueOptions(max_keypoints=MAX_KEYPOINTS // 2, pairs_at_once=1)
 CUDA_OPTIONS = LightGlueOptions(half=True)
 
 

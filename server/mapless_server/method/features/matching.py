@@ -15,6 +15,7 @@ from mapless_server.bounds import check_bounds
 from mapless_server.choices import EDGEPOINT2
 from mapless_server.scheduling import count_helper, may_have_helpers
 
+from .limits import EPIPOLAR_PX
 from .views import Features, Matches, PosedView, View
 
 _ROWS_AT_ONCE = 128
@@ -162,10 +163,10 @@ class CorrespondOptions:
         reference_ratio: Lowe's ratio, the largest distance of the nearest descriptor over that of the second-nearest,
             between references, from either of them; loose, because the epipolar constraint filters too.
         query_ratio: the same ratio for matches with the query, which have no other filter.
-        epipolar_px: largest distance from the epipolar line, in both images; keypoints are accurate to about a pixel.
-        distinct_ratio: the ratio of matches between references that show, without the poses, whether these agree.
-        wide_ratio: the ratio among the keypoints along the line; stricter, because they are few.
-        wide_similarity: smallest cosine of descriptors of a match along the line, for the same reason.
+        epipolar_px: largest distance from the epipolar line, in both images.
+        distinct_ratio: the ratio of matches between references that are distinct without the poses, which show whether
+            these agree; and among the few keypoints along an epipolar line.
+        wide_similarity: smallest cosine of descriptors of a match along the line.
         guided_similarity: smallest cosine of descriptors of a match that is searched near a point's projection.
         sampled_share: one in so many of the query's keypoints is matched with all references among which those of a
             query are chosen.
@@ -185,8 +186,7 @@ class CorrespondOptions:
     reference_ratio: float = 0.9
     query_ratio: float = 0.85
     distinct_ratio: float = 0.8
-    epipolar_px: float = 2.0
-    wide_ratio: float = 0.8
+    epipolar_px: float = EPIPOLAR_PX
     wide_similarity: float = 0.85
     guided_similarity: float = 0.89
     sampled_share: int = 6
@@ -200,7 +200,7 @@ class CorrespondOptions:
     structure_bytes: int = 32 * 2**20
 
     def __post_init__(self) -> None:
-        check_bounds(self, "reference_ratio query_ratio distinct_ratio wide_ratio", above=0, at_most=1)
+        check_bounds(self, "reference_ratio query_ratio distinct_ratio", above=0, at_most=1)
         check_bounds(self, "wide_similarity guided_similarity", at_least=-1)
         check_bounds(self, "epipolar_px", above=0)
         check_bounds(self, "sampled_share rematched_keypoints promising_references", at_least=1)
@@ -213,7 +213,6 @@ _ALIKED = CorrespondOptions(
     reference_ratio=1.0,
     query_ratio=0.95,
     distinct_ratio=0.9,
-    wide_ratio=0.9,
     wide_similarity=0.6,
     guided_similarity=0.65,
 )

@@ -19,10 +19,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from ..bundle.estimate import PosedSupport, TwoViewSupport
+from ..features.limits import EPIPOLAR_PX
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..pose.pnp import disc_chance, false_alarms, format_false_alarms, log10_tail
 from ..pose.relative import PNP, band_chance
-from ..pose.two_view_matches import EPIPOLAR_PX, TwoViewMatches
+from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .evidence import hull_px2
 from .references import moved_matches

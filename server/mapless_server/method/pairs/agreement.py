@@ -10,8 +10,9 @@ satisfies poses that are right. Where the poses place most points behind the cam
 import numpy as np
 from numpy.typing import NDArray
 
+from ..features.limits import MAX_SIDE_PX
 from ..features.views import Matches, PosedView
-from .epipolar import BEHIND_SHARE, MIN_MATCHES, QUICK_ITERATIONS, PosedMatches, fundamental_inliers
+from .epipolar import MIN_MATCHES, QUICK_ITERATIONS, PosedMatches, fundamental_inliers
 
 MAX_ERROR_PX = 3.0
 """Largest median error of a pair that agrees, pixels of an image whose longer side is 1024. Evidence:
@@ -21,14 +22,13 @@ STATIONARY_PX = 35.0
 """The same for two references at one place, where only the rotation is compared: a camera turned by hand or on a tripod
 does not turn about its centre, and what is near moves by some per cent of the image."""
 
-MAJORITY = 0.5
-"""Share of distinct matches that satisfy the poses; then no matrix is estimated: it would be that of the poses."""
-
 AMBIGUOUS_SHARE = 0.25
 """Matches that satisfy the poses, as a share of those that contradict them, from which the pair says nothing."""
 
 _MOST_MATCHES = 150
-LARGEST_ERROR_PX = _SIDE_PX = 1024.0
+
+LARGEST_ERROR_PX = float(MAX_SIDE_PX)
+"""The error of a pair whose points lie behind its cameras."""
 
 
 def thinned(matches: Matches) -> Matches:
@@ -46,14 +46,14 @@ def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> floa
     if len(matches) < MIN_MATCHES:
         return None
     matches = thinned(matches)
-    per_px = _SIDE_PX / max(max(it.view.camera.width_px, it.view.camera.height_px) for it in (first, second))
+    per_px = MAX_SIDE_PX / max(max(it.view.camera.width_px, it.view.camera.height_px) for it in (first, second))
     posed = PosedMatches.of_pair(first, second, matches)
     (is_one_place,) = posed.are_at_one_place
     scale = per_px * MAX_ERROR_PX / STATIONARY_PX if is_one_place else per_px
     errors_px = scale * np.nan_to_num(np.abs(posed.distances_px()[0]), nan=np.inf)
     agreeing: NDArray[np.bool_] = errors_px <= MAX_ERROR_PX
     consistent = agreeing
-    if agreeing.sum() < max(MIN_MATCHES, MAJORITY * len(matches)):
+    if agreeing.sum() < max(MIN_MATCHES, len(matches) / 2):  # else the matrix would be that of the poses
         consistent = fundamental_inliers(first.view, second.view, matches, QUICK_ITERATIONS)
         if not consistent.any():
             return None
@@ -64,4 +64,4 @@ def pair_error_px(first: PosedView, second: PosedView, matches: Matches) -> floa
     if error_px > MAX_ERROR_PX or is_one_place:
         return min(error_px, LARGEST_ERROR_PX)
     (behind_share,) = PosedMatches.of_pair(first, second, matches[consistent & agreeing]).behind_shares()
-    return LARGEST_ERROR_PX if behind_share > BEHIND_SHARE else error_px
+    return LARGEST_ERROR_PX if behind_share > 0.5 else error_px

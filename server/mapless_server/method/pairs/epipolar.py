@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
+from ..features.limits import INLIER_PX
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import cross_matrices
 
@@ -29,12 +30,11 @@ MIN_MATCHES = 24
 scene-agreement."""
 SAME_PLACE = 1e-6
 """Cameras that are nearer than this are at one place; in the unit of the poses."""
-PARALLAX_PX = 4.0
-"""Rays that intersect at a smaller angle, in pixels of the image, may do so behind a camera because of noise."""
 MIN_BEFORE = 8
 """Points that say whether they lie before the cameras."""
-BEHIND_SHARE = 0.5
-"""Share of these points above which the cameras face or move the other way; a few per cent for good poses."""
+
+MIN_PARALLAX_DEG = 1.0
+"""Rays of a smaller angle determine no depth: an error of a pixel changes it by several per cent."""
 
 QUICK_ITERATIONS = 30, 300
 """Least and most, of an estimate for pairs of references that a query uses: a millisecond."""
@@ -166,9 +166,12 @@ class PosedMatches:
         return np.where(np.isfinite(x[:, 0]), moved_px, np.nan)
 
     def behind_shares(self) -> Array:
-        """Shares (P,) of points behind a camera, of those with a parallax; NaN if these are too few."""
+        """Shares (P,) of points behind a camera; NaN if too few have a parallax.
+
+        Rays that intersect at a smaller angle than `INLIER_PX` may do so behind a camera because of noise.
+        """
         second = self.rays[1] @ np.swapaxes(self.turned, 1, 2)
-        return _behind(self.rays[0], second, self.baseline, PARALLAX_PX / self.focal[:, 0].min(axis=-1))
+        return _behind(self.rays[0], second, self.baseline, INLIER_PX / self.focal[:, 0].min(axis=-1))
 
 
 def _behind(first: Array, second: Array, baseline: Array, least: Array) -> Array:

@@ -165,7 +165,9 @@ class ReferencePairs:
         if matching.is_strong:
             assert self.pair_matching is not None
             base = f"{PAIR_RULE}-{self.pair_matching.name}-{options.epipolar_px}-{options.enough_matches}"
-        return f"wide-{base}-{options.wide_ratio}-{options.wide_similarity}" if matching.is_wide else f"strict-{base}"
+        return (
+            f"wide-{base}-{options.distinct_ratio}-{options.wide_similarity}" if matching.is_wide else f"strict-{base}"
+        )
 
     def match(self, first: PosedView, second: PosedView, matching: Matching = Matching.STRICT) -> Matches:
         """Finds matches between two references, each within `epipolar_px` of the epipolar line of the known poses.
@@ -287,6 +289,6 @@ class ReferencePairs:
             return strict
         similarity = first.view.features.unit_descriptors() @ second.view.features.unit_descriptors().T
         similarity[epipolar_distances_px(first, second) >= self.options.epipolar_px] = -1.0
-        (added,) = best_of_both(similarity, (self.options.wide_ratio,), self.options.wide_similarity)
+        (added,) = best_of_both(similarity, (self.options.distinct_ratio,), self.options.wide_similarity)
         taken = np.isin(added[:, 0], strict[:, 0]) | np.isin(added[:, 1], strict[:, 1])
         return np.concatenate([strict, added[~taken]])

@@ -25,12 +25,13 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera
 from mapless_server.bounds import check_bounds
 
+from ..features.limits import MAX_SIDE_PX
 from ..features.views import Matches, PosedView, View, grid_shape
 
 
 @dataclass(frozen=True)
 class StationaryOptions:
-    """Options of finding what is fixed to the camera; pixels are those of an image of 1024 columns.
+    """Options of finding what is fixed to the camera; pixels are those of an image of `MAX_SIDE_PX` columns.
 
     Attributes:
         same_px: largest distance between the pixels of a match that are the same.
@@ -66,9 +67,6 @@ class StationaryOptions:
         check_bounds(self, "unmoved_px reach", at_least=0)
 
 
-_COLUMNS = 1024.0
-
-
 def stationary_matches(
     first: PosedView, second: PosedView, matches: Matches, options: StationaryOptions
 ) -> NDArray[np.bool_]:
@@ -80,14 +78,14 @@ def stationary_matches(
         return found
     pixels, others = (it.view.features.keypoints[matches[same, side]] for side, it in enumerate((first, second)))
     off_px = distance_from_explained_px(first, second, pixels.astype(np.float64), others.astype(np.float64))
-    same = same[off_px > options.contradicted_px * second.view.camera.width_px / _COLUMNS]
+    same = same[off_px > options.contradicted_px * second.view.camera.width_px / MAX_SIDE_PX]
     if len(same) and not show_same_view(first.view, second.view, matches[moved_px <= options.unmoved_px], options):
         found[same] = True
     return found
 
 
 def displacements_px(first: View, second: View, matches: Matches) -> Array:
-    """How far apart the pixels of matches (M,) of two photographs are, along the farther axis, of 1024 columns.
+    """Distances (M,) of the pixels of matches in two photographs of `MAX_SIDE_PX` columns, along the farther axis.
 
     Photographs may have been reduced to different sizes; infinite if their sides have different ratios.
     """
@@ -99,8 +97,8 @@ def displacements_px(first: View, second: View, matches: Matches) -> Array:
 
 
 def in_columns(camera: Camera, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Pixels (N, 2) of an image as those of an image of 1024 columns, which photographs of any size share."""
-    return np.asarray((pixels + np.float32(0.5)) * np.float32(_COLUMNS / camera.width_px))
+    """Pixels (N, 2) of an image as those of `MAX_SIDE_PX` columns, which photographs of any size share."""
+    return np.asarray((pixels + np.float32(0.5)) * np.float32(MAX_SIDE_PX / camera.width_px))
 
 
 def show_same_view(first: View, second: View, unmoved: Matches, options: StationaryOptions) -> bool:

@@ -19,6 +19,7 @@ from mapless_server.bounds import check_bounds
 
 from ..bundle.estimate import PoseEstimate, PoseStage
 from ..bundle.priors import NO_PRIORS, Priors
+from ..features.limits import INLIER_PX, LOSS_SCALE_PX
 from ..features.views import View
 from ..optim.optimize import pose_hessian, world_covariance
 from ..rejection import Rejection, RejectionReason
@@ -31,9 +32,6 @@ pose with that share of inliers, but for one case in 10^8."""
 
 MIN_MATCHES = 6
 """Fewer give no pose."""
-
-LOSS_SCALE_PX = 1.0
-"""Scale of the Cauchy loss in PoseLib's refinements; about the error of a good keypoint."""
 
 REFINEMENT = {"loss_type": "CAUCHY", "loss_scale": LOSS_SCALE_PX}
 """PoseLib's options of the refinement after RANSAC. PoseLib silently ignores options that it does not know."""
@@ -56,7 +54,7 @@ class PnpOptions:
         max_matches: largest number of matches, evenly thinned; more are not more accurate, and scoring is linear in it.
     """
 
-    inlier_px: float = 4.0
+    inlier_px: float = INLIER_PX
     min_iterations: int = 100
     max_iterations: int = 20_000
     max_matches: int = 2000

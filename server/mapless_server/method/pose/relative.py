@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless_server.bounds import check_bounds
 
+from ..features.limits import EPIPOLAR_PX
 from ..features.views import PosedView, View
 from ..structure.model import PixelPoints
 from .pnp import (
@@ -35,7 +36,7 @@ from .pnp import (
     poselib_pose,
     ransac,
 )
-from .two_view_matches import EPIPOLAR_PX, TwoViewMatches
+from .two_view_matches import TwoViewMatches
 
 PNP = PnpOptions()
 """Options of poses from 2D-3D matches, and the bound of their inliers."""

@@ -17,6 +17,7 @@ from ..bundle.adjust import adjust_pose
 from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage, TwoViewSupport
 from ..bundle.pose_problem import AdjustInput, AdjustOptions
 from ..bundle.priors import IntrinsicsSigma
+from ..features.limits import EPIPOLAR_PX
 from ..features.tracks import Tracks
 from ..features.views import PosedView, View
 from ..pairs.correspond import Correspondences
@@ -24,7 +25,7 @@ from ..structure.match import MatchOptions, match_points, vote
 from ..structure.model import PointMatches, Structure
 from ..structure.structure import StructureOptions, triangulated_structure
 from .relative import Evidence, RelativePoseOptions, find_pose, score
-from .two_view_matches import EPIPOLAR_PX, TwoViewMatches
+from .two_view_matches import TwoViewMatches
 
 MIN_PARALLAX_DEG = 0.5
 """Matches with a smaller parallax are not adjusted: their points have no depth."""

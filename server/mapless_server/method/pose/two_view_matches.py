@@ -26,9 +26,6 @@ from ..features.views import Matches, PosedView, View
 from ..structure.observations import KeypointNoise, triangulate
 from ..structure.structure import observe
 
-EPIPOLAR_PX = 2.0
-"""Largest Sampson distance of a match that agrees with a pose; keypoints are accurate to about a pixel."""
-
 
 @dataclass(frozen=True, eq=False)
 class TwoViewMatches:

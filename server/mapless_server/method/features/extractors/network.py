@@ -9,19 +9,21 @@ from numpy.typing import NDArray
 
 from mapless_server.bounds import check_bounds
 
+from ..limits import MAX_KEYPOINTS, MAX_SIDE_PX
+
 
 @dataclass(frozen=True)
 class LearnedOptions:
     """Options of a learned extractor.
 
     Attributes:
-        max_keypoints: the strongest are kept; matching is quadratic in it.
-        max_side_px: longer images are reduced to it; the size that the networks were trained and published with.
+        max_keypoints: the strongest are kept.
+        max_side_px: longer images are reduced to it.
         min_score: weaker keypoints are dropped; the extractor's docstring gives the range of its scores.
     """
 
-    max_keypoints: int = 2048
-    max_side_px: int = 1024
+    max_keypoints: int = MAX_KEYPOINTS
+    max_side_px: int = MAX_SIDE_PX
     min_score: float = 0.01
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera
 from mapless_server.bounds import check_bounds
 
+from ..limits import MAX_KEYPOINTS, MAX_SIDE_PX
 from ..masks import are_usable, usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
 
@@ -19,13 +20,13 @@ class SiftOptions:
     """Options of SIFT.
 
     Attributes:
-        max_keypoints: the strongest are kept; matching is quadratic in it.
-        max_side_px: longer images are reduced to it; beyond it SIFT gains little and costs much.
+        max_keypoints: the strongest are kept.
+        max_side_px: longer images are reduced to it.
         contrast_threshold: half of OpenCV's default, for weakly textured walls; `max_keypoints` bounds the rest.
     """
 
-    max_keypoints: int = 2048
-    max_side_px: int = 1024
+    max_keypoints: int = MAX_KEYPOINTS
+    max_side_px: int = MAX_SIDE_PX
     contrast_threshold: float = 0.02
 
     def __post_init__(self) -> None:

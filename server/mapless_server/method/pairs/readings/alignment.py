@@ -20,27 +20,19 @@ import poselib
 
 from mapless.geometry import Array, Similarity, cross_matrix, rotation_angle_deg, rotation_from_vector
 
+from ...features.limits import LOSS_SCALE_PX
 from ...features.views import PosedView
 from ...optim.optimize import MinimizeOptions, damped_step, minimize, rotation_vector, soft_l1, soft_l1_weight
-from .errors import MatchedPair, PairSample, Views, summary
+from .errors import FEW_SHARE, SAMPLED_MATCHES, MatchedPair, PairSample, Views, summary
 
 MOST_PAIRS = 24
-MOST_MATCHES = 64
-"""Matches of a pair that are used; the similarity is then known better than a session's own poses."""
-MOST_TRIED = 60
-"""Solutions of two pairs."""
+"""Pairs that are used, those with the most matches; every two of them give a solution."""
 AGREEING_DEG = 5.0
 """Between the rotations of two pairs. Relative poses of few matches are off by a degree or two."""
-LEAST_PAIRS = 3
-LEAST_PHOTOGRAPHS = 2
-"""Photographs of either world that must take part."""
-MOST_BAD = 0.25
-"""Share of the pairs that may not fit."""
-SCALE_SIGMA, ROTATION_SIGMA_DEG, POSITION_SIGMA = 0.03, 1.0, 0.03
-"""Largest standard deviations of a unique similarity: of the scale, relative; of the rotation; and of the position of
-the other session's middle, as a share of its extent or, if that is more, of the distance between paired cameras."""
-LOSS_PX = 1.0
-"""Scale of the robust loss: keypoints are accurate to about a pixel."""
+MAX_SIGMA = 0.03
+"""Largest standard deviations of a unique similarity: of the scale, relative; of the rotation, radians; and of the
+position of the other session's middle, as a share of its extent or, if that is more, of the distance between paired
+cameras."""
 STEPS = MinimizeOptions(30, 1e-6)
 _DIFFERENCE = 1e-6
 _INFLATION = 3.0  # errors of matches of a pair, and of poses of a session, are not independent
@@ -56,7 +48,7 @@ class Alignment:
         bad_share: share of the pairs that do not fit with it.
         pair_count: number of pairs.
         scale_sigma: standard deviation of the scale, relative.
-        rotation_sigma_deg: standard deviation of the rotation.
+        rotation_sigma: standard deviation of the rotation, radians.
         position_sigma: standard deviation of the position of the other session's middle, as a share of its extent.
     """
 
@@ -65,18 +57,14 @@ class Alignment:
     bad_share: float
     pair_count: int
     scale_sigma: float
-    rotation_sigma_deg: float
+    rotation_sigma: float
     position_sigma: float
 
     @property
     def is_unique(self) -> bool:
         """Whether the pairs determine all of it, and fit."""
-        return (
-            self.bad_share <= MOST_BAD
-            and self.scale_sigma <= SCALE_SIGMA
-            and self.rotation_sigma_deg <= ROTATION_SIGMA_DEG
-            and self.position_sigma <= POSITION_SIGMA
-        )
+        largest = max(self.scale_sigma, self.rotation_sigma, self.position_sigma)
+        return self.bad_share <= FEW_SHARE and largest <= MAX_SIGMA
 
     @property
     def text(self) -> str:
@@ -92,12 +80,12 @@ class Alignment:
 def align(views: Views, matched: Sequence[MatchedPair]) -> Alignment | None:
     """Finds the similarity from the world of the pairs' second photographs to that of their first ones.
 
-    None if the pairs are too few, or no similarity fits most of them.
+    None if no similarity fits any of them.
     """
     matched = sorted(matched, key=lambda it: -len(it.matches))[:MOST_PAIRS]
-    if len(matched) < LEAST_PAIRS or min(len({it.pair[side] for it in matched}) for side in (0, 1)) < LEAST_PHOTOGRAPHS:
+    if not matched:
         return None
-    sample = PairSample(views, matched, MOST_MATCHES)
+    sample = PairSample(views, matched, SAMPLED_MATCHES)
     worlds = _Worlds.of(sample, [it.pair for it in matched])
     start = _start(worlds, _relative_poses(views, matched))
     return None if start is None else worlds.refined(start)
@@ -164,8 +152,8 @@ class _Worlds:
         median_px, bad_share = self.measured(found)
         information = self.linearize(found)[0] / max(_INFLATION * median_px, 1e-3) ** 2
         sigmas = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information + 1e-12 * np.eye(7))), 0.0))
-        rotation_deg, position = math.degrees(float(sigmas[1:4].max())), float(sigmas[4:].max())
-        return Alignment(found, median_px, bad_share, len(self.sample.pairs), float(sigmas[0]), rotation_deg, position)
+        scale, rotation, position = float(sigmas[0]), float(sigmas[1:4].max()), float(sigmas[4:].max())
+        return Alignment(found, median_px, bad_share, len(self.sample.pairs), scale, rotation, position)
 
     def distances_px(self, x: Similarity) -> Array:
         """Signed distances of all matches, pixels; 0 where there is none."""
@@ -174,7 +162,7 @@ class _Worlds:
 
     def cost(self, x: Similarity) -> float:
         """See Problem."""
-        return float(soft_l1(self.distances_px(x) ** 2, LOSS_PX).sum())
+        return float(soft_l1(self.distances_px(x) ** 2, LOSS_SCALE_PX).sum())
 
     def linearize(self, x: Similarity) -> tuple[Array, Array]:
         """Normal equations (7, 7), (7,); derivatives by differences."""
@@ -182,7 +170,7 @@ class _Worlds:
         changes = [self.distances_px(self.changed(x, it)) - self.distances_px(self.changed(x, -it)) for it in steps]
         derivatives = np.stack(changes, axis=1) / (2 * _DIFFERENCE)
         distances = self.distances_px(x)
-        weighted = derivatives * soft_l1_weight(distances**2, LOSS_PX)[:, None]
+        weighted = derivatives * soft_l1_weight(distances**2, LOSS_SCALE_PX)[:, None]
         return weighted.T @ derivatives, weighted.T @ distances
 
     def step(self, x: Similarity, equations: tuple[Array, Array], damping: float) -> Similarity | None:
@@ -227,8 +215,7 @@ def _start(worlds: _Worlds, poses: Sequence[tuple[Array, Array, Array, Array]]) 
     rotation = np.asarray(u @ vt)
     if np.linalg.det(rotation) < 0:
         return None
-    subsets = list(combinations(chosen, 2))
-    subsets = subsets[:: 1 + len(subsets) // MOST_TRIED]
+    subsets = combinations(chosen, 2)
     candidates = [_linear(worlds, rotation, [poses[k] for k in subset]) for subset in [chosen, *subsets]]
     scored = [(*worlds.measured(it)[::-1], it) for it in candidates if it is not None]
     bad_share, _, best = min(scored, key=lambda it: it[:2], default=(1.0, math.inf, None))

@@ -4,16 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..epipolar import triangulate_depths
+from ..epipolar import MIN_PARALLAX_DEG, triangulate_depths
 from .errors import MatchedPair, Views
 
-MIN_PARALLAX_DEG = 1.0
-"""Smallest angle between intersected rays: an error of a pixel then changes the depth by about a fiftieth."""
 MIN_POINTS = 100
-"""Fewer give no typical depth."""
+"""Fewer points give no typical depth."""
 MIN_DEPTH_M, MAX_DEPTH_M = 0.05, 500.0
-"""Typical depths of photographs of places are 0.3 to 300 m. Those in millimetres come out a thousand times as large, in
-kilometres as small. Evidence: scene-agreement."""
+"""Plausible median depths of photographs, metres; other units differ by a thousand. Evidence: scene-agreement."""
 
 
 def median_depth(views: Views, matched: Sequence[MatchedPair]) -> float | None:

@@ -13,21 +13,28 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from ...features.matching import mutual_matches
+from ...features.limits import MAX_SIDE_PX
+from ...features.matching import CorrespondOptions, mutual_matches
 from ...features.views import Features, Matches, PosedView, View
 from ..agreement import MAX_ERROR_PX
-from ..epipolar import BEHIND_SHARE, PosedMatches, fundamental_inliers
+from ..epipolar import PosedMatches, fundamental_inliers
 
 Pair = tuple[int, int]
 """Indices of two photographs."""
 
-RATIO = 0.8
-"""Lowe's ratio; strict, since few right matches are better here than many with some wrong ones."""
+SAMPLED_MATCHES = 64
+"""Matches of a pair that explanations are compared by; a median of so many distinguishes mistakes."""
+
+WRONG_SHARE = 0.4
+"""Share of bad pairs above which more than single photographs are wrong, one of which makes one pair in five bad."""
+
+FEW_SHARE = 0.25
+"""Largest share of exceptions: of bad pairs where the poses should fit, of good pairs where they should not."""
 
 
 def distinct_matches(first: View, second: View) -> Matches:
     """Matches of descriptors that nothing else in the other view resembles."""
-    return mutual_matches(first.features, second.features, RATIO)
+    return mutual_matches(first.features, second.features, CorrespondOptions.distinct_ratio)
 
 
 def consistent(first: View, second: View, matches: Matches) -> Matches:
@@ -58,8 +65,8 @@ class PairError:
 
     @property
     def is_behind(self) -> bool:
-        """Whether its points lie behind the cameras."""
-        return self.behind_share > BEHIND_SHARE
+        """Whether most of its points lie behind a camera."""
+        return self.behind_share > 0.5
 
     @property
     def is_bad(self) -> bool:
@@ -122,7 +129,7 @@ class PairSample:
         x = np.where(self._is_match[..., None], pixels.astype(np.float64), np.nan)
         ends = self._ends + np.array([0, len(self._position)])
         sides = np.array([max(it.view.camera.width_px, it.view.camera.height_px) for it in ordered])
-        return PosedMatches.of(ordered, ends, x), MAX_ERROR_PX * sides[ends].max(axis=1) / 1024
+        return PosedMatches.of(ordered, ends, x), MAX_ERROR_PX * sides[ends].max(axis=1) / MAX_SIDE_PX
 
 
 def _with_rows(posed: PosedView, rows: NDArray[np.intp]) -> PosedView:

@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...features.views import PosedView
+from ..agreement import LARGEST_ERROR_PX
 from .alignment import align_sessions
 from .conventions import CONVENTIONS, RARE, STRANGE, USUAL, Convention, Mistake
-from .errors import MatchedPair, PairError, PairSample, Views, summary
-from .intrinsics import FIELDS_DEG, camera_mistakes, focal_scaled, is_unset, of_field, scaled, with_camera
+from .errors import FEW_SHARE, SAMPLED_MATCHES, MatchedPair, PairError, PairSample, Views, summary
+from .intrinsics import camera_mistakes, focal_scaled, is_unset, scaled, usual_camera, with_camera
 from .rounding import rounding_text
 from .sessions import sessions_of
 
@@ -25,19 +26,11 @@ FOCAL_TOLERANCE = 0.03
 """A focal length that would have to change by less is not the reason."""
 GAIN = 0.4
 """Share of the error that an explanation may leave."""
-BAD_SHARE = 0.5
-"""Share of the pairs that may stay bad."""
-MIXED_BAD_SHARE = 0.2
-"""The same where each pair is given the choice of which of its two to correct."""
 EQUAL_SHARE, EQUAL_PX = 1.25, 0.1
 """Errors that differ by less than this factor, and this distance, are equal: noise of medians."""
-COVERED_SHARE = 0.8
-"""Share of the photographs that two sessions must explain."""
 MOST_NAMED = 2
 """Explanations that are named together, of those that fit equally well."""
 _REFINEMENTS = 3
-_ENOUGH_MATCHES = 64  # for a median that distinguishes mistakes
-_BEHIND_PX = 1000.0  # stands for the error of a pair whose points lie behind its cameras
 
 
 @dataclass(frozen=True)
@@ -62,7 +55,7 @@ class _Candidate:
 
 def explain(views: Views, matched: Sequence[MatchedPair]) -> Explanation:
     """Finds the mistake whose correction makes the poses fit."""
-    sample = PairSample(views, [item for item in matched if len(item.matches)], _ENOUGH_MATCHES)
+    sample = PairSample(views, [item for item in matched if len(item.matches)], SAMPLED_MATCHES)
     if not sample.pairs:
         return Explanation()
     errors = sample.measure()
@@ -70,7 +63,7 @@ def explain(views: Views, matched: Sequence[MatchedPair]) -> Explanation:
     mistakes = [*map(_of_view, CONVENTIONS), *camera_mistakes(list(sample.views.values()))]
     candidates = [_Candidate(it.text, *_score_with(sample, it.correct), it.rarity) for it in mistakes]
     candidates += _scalings(sample)
-    fitting = [it for it in candidates if it.bad_share < BAD_SHARE and it.error_px < GAIN * given_px]
+    fitting = [it for it in candidates if it.bad_share < 0.5 and it.error_px < GAIN * given_px]
     if fitting:
         return _named(fitting)
     if text := rounding_text(sample, summary(errors)[0]):
@@ -86,7 +79,7 @@ def explain(views: Views, matched: Sequence[MatchedPair]) -> Explanation:
 def _sessions(views: Views, matched: Sequence[MatchedPair], errors: Sequence[PairError]) -> Explanation | None:
     """Explains pairs by two sessions, with the similarity that aligns the smaller one, if the pairs determine it."""
     groups = sessions_of({it.pair: not it.is_bad for it in errors})
-    if groups is None or sum(map(len, groups)) < COVERED_SHARE * len({i for it in errors for i in it.pair}):
+    if groups is None or sum(map(len, groups)) < (1 - FEW_SHARE) * len({i for it in errors for i in it.pair}):
         return None
     first, second = groups
     text = (
@@ -119,7 +112,7 @@ def _of_view(convention: Convention) -> Mistake[PosedView]:
 
 def _score(errors: Sequence[PairError]) -> tuple[float, float]:
     """Median error, that of pairs behind their cameras being large, and share of bad pairs."""
-    costs = [_BEHIND_PX if it.is_behind or math.isnan(it.error_px) else it.error_px for it in errors]
+    costs = [LARGEST_ERROR_PX if it.is_behind or math.isnan(it.error_px) else it.error_px for it in errors]
     return float(np.median(costs)), float(np.mean([it.is_bad for it in errors]))
 
 
@@ -146,14 +139,13 @@ def _scalings(sample: PairSample) -> Iterator[_Candidate]:
 def _unset(sample: PairSample) -> Iterator[_Candidate]:
     """A focal length of no camera: the one that fits, with the principal point in the image's centre."""
 
-    def with_field(view: PosedView, field_deg: float) -> PosedView:
-        return with_camera(view, of_field(view.view.camera, field_deg))
+    def change(view: PosedView, scale: float) -> PosedView:
+        return focal_scaled(with_camera(view, usual_camera(view.view.camera)), scale)
 
-    field = min(FIELDS_DEG, key=lambda deg: _score_with(sample, lambda view: with_field(view, deg))[0])
-    scale, error_px, bad_share = best_scale(sample, lambda view, scale: focal_scaled(with_field(view, field), scale))
+    scale, error_px, bad_share = best_scale(sample, change)
     cameras = [it.view.camera for it in sample.views.values()]
     given = np.median([it.focal_x_px for it in cameras])
-    found = np.median([scale * of_field(it, field).focal_x_px for it in cameras])
+    found = np.median([scale * usual_camera(it).focal_x_px for it in cameras])
     text = (
         f"K was not set (a camera that is not calibrated), or is not in pixels: focal lengths of {given:.3g} px are "
         f"those of no camera; about {found:.0f} px fit"
@@ -190,6 +182,6 @@ def _mixed(sample: PairSample, mistake: Mistake[PosedView]) -> Explanation:
             votes[i] += 1 if chosen in ((1, 3), (2, 3))[side] else -1
     error_px, bad_share = _score(best)
     concerned = tuple(sorted(i for i, votes_for in votes.items() if votes_for > 0))
-    if bad_share >= MIXED_BAD_SHARE or not concerned:
+    if bad_share >= FEW_SHARE or not concerned:
         return Explanation()
     return Explanation(f"with some photographs, not all, {mistake.text}", error_px, concerned)

@@ -4,7 +4,6 @@ Some leave a mark: a principal point at the first pixel is that of a K given by 
 of a K that was never set. What was meant is then unknown, and the image's centre and a focal length that fits stand in.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -19,8 +18,6 @@ LEAST_FOCAL_SHARE = 0.1
 """Share of the image's longer side; a shorter focal length would be a pinhole with more than 157 degrees of view."""
 SAME_SHARE = 0.01
 """Share of the image's longer side; coordinates that differ by less cannot be distinguished."""
-FIELDS_DEG = (30.0, 45.0, 60.0, 75.0, 90.0, 110.0, 130.0)
-"""Horizontal fields of view from which a focal length that is unknown is searched."""
 
 
 def with_camera(posed: PosedView, camera: Camera) -> PosedView:
@@ -39,10 +36,9 @@ def centred(camera: Camera) -> Camera:
     return replace(camera, principal_x_px=(camera.width_px - 1) / 2, principal_y_px=(camera.height_px - 1) / 2)
 
 
-def of_field(camera: Camera, field_deg: float) -> Camera:
-    """A camera with square pixels, a centred principal point, and this field of view along the longer side."""
-    longer = max(camera.width_px, camera.height_px)
-    focal_px = longer / 2 / math.tan(math.radians(field_deg) / 2)
+def usual_camera(camera: Camera) -> Camera:
+    """A camera with square pixels, a centred principal point, and the longer side as its focal length: 53 degrees."""
+    focal_px = float(max(camera.width_px, camera.height_px))
     return replace(centred(camera), focal_x_px=focal_px, focal_y_px=focal_px)
 
 

@@ -11,20 +11,18 @@ import numpy as np
 
 from mapless.geometry import RigidTransform, rotation_angle_deg
 
-from .errors import MatchedPair, Pair, PairError, Views
+from .errors import FEW_SHARE, MatchedPair, Pair, PairError, Views
 
 OFF_FACTOR = 4.0
-"""Thresholds by which photographs of one place are off if they show different things: 12 px of 1024. A pose that is
+"""Photographs of one place show different things if their error is so many times that of a good pair; a pose that is
 given to the next frames of a video, too, is off by less."""
 SAME_PX = 0.5
-"""Largest median distance of the matched keypoints of one photograph that was stored twice, as encoded anew."""
-SAME_COUNT_SHARE = 0.5
-"""Least share of the keypoints that such photographs match."""
-SAME_TURN_DEG, SAME_BASELINE_SHARE = 1.0, 0.25
-"""Differences of two poses of such a photograph that contradict each other; of the median distance of matched pairs. A
-camera that stands still takes nearly the same photograph at poses that differ by the tracking's noise."""
-_START = 1e-9
-"""Numbers of a pose that differ by less are equal but for rounding."""
+"""Largest median distance of the matched keypoints of one photograph that is stored twice, encoded anew."""
+SAME_TURN_DEG = 1.0
+"""Poses of such a photograph contradict each other if they differ by more: a camera that stands still has the
+tracking's noise. Distances contradict from `FEW_SHARE` of the median distance of matched pairs on."""
+EXACT_DIGITS = 8
+"""Digits after the point to which numbers of a pose are equal but for rounding."""
 
 
 def same_poses(poses: Mapping[int, RigidTransform]) -> list[tuple[int, ...]]:
@@ -32,14 +30,14 @@ def same_poses(poses: Mapping[int, RigidTransform]) -> list[tuple[int, ...]]:
     groups: dict[tuple[float, ...], list[int]] = {}
     for i, pose in poses.items():
         numbers = np.concatenate([pose.rotation.ravel(), pose.translation])
-        groups.setdefault(tuple((np.round(numbers, 8) + 0.0).tolist()), []).append(i)
+        groups.setdefault(tuple((np.round(numbers, EXACT_DIGITS) + 0.0).tolist()), []).append(i)
     return [tuple(group) for group in groups.values() if len(group) > 1]
 
 
 def is_start(pose: RigidTransform) -> bool:
     """Whether a pose is the identity, as that of a tracker that has not begun; possibly in a format's other axes."""
-    axes = np.abs(pose.rotation)
-    return bool(np.abs(pose.translation).max() < _START and np.abs(axes - np.round(axes)).max() < _START)
+    axes, least = np.abs(pose.rotation), 10.0**-EXACT_DIGITS
+    return bool(np.abs(pose.translation).max() < least and np.abs(axes - np.round(axes)).max() < least)
 
 
 def contradicting_groups(
@@ -67,12 +65,10 @@ def same_photographs(views: Views, matched: Sequence[MatchedPair]) -> list[Pair]
     found = []
     for item, (apart, turn_deg) in zip(matched, differences, strict=True):
         first, second = (views[i].view for i in item.pair)
-        if not first.has_camera_of(second) or len(item.matches) < SAME_COUNT_SHARE * min(
-            len(first.features), len(second.features)
-        ):
+        if not first.has_camera_of(second) or len(item.matches) < min(len(first.features), len(second.features)) / 2:
             continue
         ours, theirs = (view.features.keypoints[item.matches[:, side]] for side, view in enumerate((first, second)))
-        is_other = turn_deg > SAME_TURN_DEG or apart > SAME_BASELINE_SHARE * typical
+        is_other = turn_deg > SAME_TURN_DEG or apart > FEW_SHARE * typical
         if is_other and np.median(np.linalg.norm(ours - theirs, axis=1)) < SAME_PX:
             found.append(item.pair)
     return found

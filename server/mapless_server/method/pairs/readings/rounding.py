@@ -14,16 +14,14 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
 from ...features.views import PosedView
 from .errors import PairSample, summary
+from .repeats import EXACT_DIGITS
 
-LEAST_COUNT = 4
-"""Poses whose numbers say something."""
-DIGITS = (1, 2, 3, 4)
-"""Digits after the point that are tried for rotations."""
-POSITION_DIGITS = range(-4, 7)
-"""The same of positions; negative before it."""
-_ROUNDED_SHARE = 0.3  # of rotations that come of a rounded matrix, which is not one before it is made one
-_EXACT = 1e-8
-_FACTOR = 3.0  # between the errors that are found and those that the steps make
+DIGITS = range(-4, 7)
+"""Digits after the point that are tried, negative before it; of rotations those after it."""
+ROUNDED_SHARE = 0.3
+"""Least share of rotations that are of a rounded matrix: some need more steps to become one."""
+EXPLAINED_FACTOR = 3.0
+"""Rounding explains errors that are at most so many times those that it makes."""
 
 
 def steps_of(poses: Sequence[RigidTransform]) -> tuple[Array, float]:
@@ -31,9 +29,7 @@ def steps_of(poses: Sequence[RigidTransform]) -> tuple[Array, float]:
 
     A pose that is given several times counts once.
     """
-    poses = list({pose.matrix().round(8).tobytes(): pose for pose in poses}.values())
-    if len(poses) < LEAST_COUNT:
-        return np.zeros(3), 0.0
+    poses = list({pose.matrix().round(EXACT_DIGITS).tobytes(): pose for pose in poses}.values())
     positions = np.array([pose.translation for pose in poses])
     return np.array([_step(positions[:, axis]) for axis in range(3)]), _rotation_step(poses)
 
@@ -42,20 +38,20 @@ def _step(values: Array) -> float:
     """The largest decimal or single-precision step of which all values are multiples; 0 if they are constant."""
     if np.ptp(values) == 0:
         return 0.0
-    for digits in POSITION_DIGITS:
+    for digits in DIGITS:
         step = 10.0**-digits
         multiples = values / step
         if (np.abs(multiples - np.round(multiples)) <= np.maximum(1e-6, 1e-15 * np.abs(multiples) * 4)).all():
-            return step if digits < max(POSITION_DIGITS) else 0.0
+            return step if digits < DIGITS[-1] else 0.0
     if np.array_equal(values.astype(np.float32).astype(float), values):
         return float(np.spacing(np.float32(np.abs(values).max())))
     return 0.0
 
 
 def _rotation_step(poses: Sequence[RigidTransform]) -> float:
-    for digits in DIGITS:
+    for digits in range(1, DIGITS.stop):
         rounded = [_is_of_rounded_matrix(pose, digits) or _is_of_rounded_quaternion(pose, digits) for pose in poses]
-        if np.mean(rounded) >= _ROUNDED_SHARE:
+        if np.mean(rounded) >= ROUNDED_SHARE:
             return 10.0**-digits
     return 0.0
 
@@ -63,7 +59,7 @@ def _rotation_step(poses: Sequence[RigidTransform]) -> float:
 def _is_of_rounded_matrix(pose: RigidTransform, digits: int) -> bool:
     rounded = np.round(pose.rotation, digits)
     u, _, vt = np.linalg.svd(rounded)
-    return bool(np.abs(u @ vt - pose.rotation).max() < _EXACT)
+    return bool(np.abs(u @ vt - pose.rotation).max() < 10.0**-EXACT_DIGITS)
 
 
 def _is_of_rounded_quaternion(pose: RigidTransform, digits: int) -> bool:
@@ -71,7 +67,7 @@ def _is_of_rounded_quaternion(pose: RigidTransform, digits: int) -> bool:
     numbers = np.array([q.x, q.y, q.z, q.w])
     rounded = np.round(numbers, digits)
     length = float(np.linalg.norm(rounded))
-    return length > 0 and bool(np.abs(rounded / length - numbers).max() < _EXACT)
+    return length > 0 and bool(np.abs(rounded / length - numbers).max() < 10.0**-EXACT_DIGITS)
 
 
 def rounding_text(sample: PairSample, given_px: float) -> str:
@@ -80,7 +76,7 @@ def rounding_text(sample: PairSample, given_px: float) -> str:
 
     def explain(position: Array, rotation: float) -> bool:
         made_px, _ = summary(sample.measure(_moved(sample.views, position, rotation)))
-        return given_px <= _FACTOR * made_px
+        return given_px <= EXPLAINED_FACTOR * made_px
 
     parts = []
     if position.any() and explain(position, 0.0):

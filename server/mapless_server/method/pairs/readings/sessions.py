@@ -8,14 +8,16 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from typing import TypeVar
 
+from .errors import FEW_SHARE
+
 K = TypeVar("K", int, str)
 """A photograph: its index, or the key of its reference."""
 
-MIN_GROUP, MIN_BETWEEN, MAX_BETWEEN_SHARE, MIN_INSIDE_SHARE = 3, 6, 0.25, 0.8
-"""Photographs of a session; pairs between two; how many of these may agree, and how many inside each must:
-docs/evidence/scene-agreement.md."""
+MIN_GROUP, MIN_BETWEEN = 3, 6
+"""Least number of photographs of a session, and of pairs between two sessions. Evidence: scene-agreement."""
 
-_ROUNDS = 3
+MIN_INSIDE_SHARE = 0.8
+"""Least share of the pairs inside a session that agree. Evidence: scene-agreement."""
 
 
 def sessions_of(agrees: Mapping[tuple[K, K], bool]) -> tuple[tuple[K, ...], tuple[K, ...]] | None:
@@ -39,7 +41,7 @@ def sessions_of(agrees: Mapping[tuple[K, K], bool]) -> tuple[tuple[K, ...], tupl
         return [vote for key in members[of] for other, vote in links[key].items() if group[other] == with_group]
 
     between = votes(first_group, second_group)
-    if len(between) < MIN_BETWEEN or between.count(1) > MAX_BETWEEN_SHARE * len(between):
+    if len(between) < MIN_BETWEEN or between.count(1) > FEW_SHARE * len(between):
         return None
     if any(inside.count(1) < MIN_INSIDE_SHARE * len(inside) for inside in (votes(it, it) for it in large[:2])):
         return None
@@ -50,7 +52,8 @@ def _grouped(links: Mapping[K, Mapping[K, int]]) -> dict[K, int]:
     """Groups of photographs: each is in the group with which most of its pairs agree, by the number of votes."""
     group: dict[K, int] = {}
     order = _along_agreeing(links)
-    for _ in range(_ROUNDS):
+    before: dict[K, int] | None = None
+    while group != before:  # each change makes more pairs agree
         before = dict(group)
         for number, key in enumerate(order):
             votes: Counter[int] = Counter()
@@ -62,8 +65,6 @@ def _grouped(links: Mapping[K, Mapping[K, int]]) -> dict[K, int]:
                 group[key] = best
             elif key not in group:
                 group[key] = len(order) + number
-        if group == before:
-            break
     return group
 
 

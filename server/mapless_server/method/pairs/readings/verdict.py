@@ -9,16 +9,9 @@ import numpy as np
 
 from ..agreement import MAX_ERROR_PX
 from .depth import median_depth
-from .errors import MatchedPair, Pair, PairError, Views, errors_of, summary
+from .errors import FEW_SHARE, WRONG_SHARE, MatchedPair, Pair, PairError, Views, errors_of, summary
 from .explanation import explain
 from .repeats import contradicting_groups, same_photographs
-
-WRONG_SHARE = 0.4
-"""Share of bad pairs above which the scene as a whole is wrong: more than one photograph in five could make."""
-LEFT_SHARE = 0.25
-"""Share of a wrong scene's bad pairs that may remain without the suspects, if these are the reason."""
-_SUSPECT_SHARE = 0.6
-_SUSPECT_PAIRS = 2
 
 
 @dataclass(frozen=True)
@@ -79,7 +72,7 @@ def judge(
     suspects = suspects_of(errors)
     left = [error for error in errors if not set(suspects) & set(error.pair)]
     # Where hardly anything is left that fits, nobody knows which photographs are wrong.
-    is_known = len(left) >= LEFT_SHARE * len(errors) and summary(left)[1] <= WRONG_SHARE
+    is_known = len(left) >= FEW_SHARE * len(errors) and summary(left)[1] <= WRONG_SHARE
     return replace(verdict, suspects=suspects if is_known else ())
 
 
@@ -90,7 +83,7 @@ def suspects_of(errors: Sequence[PairError]) -> tuple[int, ...]:
     while True:
         total = Counter(i for error in left for i in error.pair)
         bad = Counter(i for error in left if error.is_bad for i in error.pair)
-        doubtful = [i for i in bad if bad[i] >= _SUSPECT_PAIRS and bad[i] >= _SUSPECT_SHARE * total[i]]
+        doubtful = [i for i in bad if bad[i] >= 2 and bad[i] >= (1 - WRONG_SHARE) * total[i]]
         if not doubtful:
             return tuple(suspects)
         worst = max(doubtful, key=lambda i: (bad[i] / total[i], bad[i], -i))

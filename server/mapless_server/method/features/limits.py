@@ -1,0 +1,16 @@
+"""Limits that hold wherever keypoints are found, matched and explained; pixels are those of the processed image."""
+
+MAX_SIDE_PX = 1024
+"""Longer images are reduced to this side before features are found; networks were trained and published with it."""
+
+MAX_KEYPOINTS = 2048
+"""The strongest keypoints of an image that are kept; matching is quadratic in it."""
+
+LOSS_SCALE_PX = 1.0
+"""Scale of robust losses of reprojection errors; about the error of a good keypoint."""
+
+EPIPOLAR_PX = 2.0
+"""Largest distance of a right match from its epipolar line."""
+
+INLIER_PX = 4.0
+"""Largest reprojection error of a right match."""
