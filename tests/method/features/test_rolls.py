@@ -12,7 +12,6 @@ from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.extractors.turned import extract_turned
 from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.rolls import (
-    LARGEST_SWING_DEG,
     LEAST_AGREEMENT,
     apart_deg,
     are_alike,
@@ -64,7 +63,7 @@ def test_the_roll_of_a_rotation_is_its_turn_about_the_axis() -> None:
 @pytest.mark.parametrize("swing_deg", [59.0, 61.0, 180.0])
 def test_cameras_that_look_elsewhere_have_no_roll(swing_deg: float) -> None:
     swing = Rotation.from_rotvec([0.0, np.radians(swing_deg), 0.0]).as_matrix()
-    assert (roll_of_rotation(swing) is None) == (swing_deg > LARGEST_SWING_DEG)
+    assert (roll_of_rotation(swing) is None) == (swing_deg > 60)
 
 
 def test_a_direction_seen_by_both_shows_the_roll() -> None:

@@ -300,6 +300,7 @@ def test_without_matches_the_hint_is_the_furthest_photographs() -> None:
 
 
 PNP = PnpOptions()
+QUICK = replace(PNP, max_iterations=100, max_matches=600)
 TURNED_RIG = RigidTransform(rotation_from_vector([0.3, -0.2, 0.5]), np.array([1.0, -2.0, 3.0]))
 
 
@@ -334,7 +335,7 @@ def test_rig_ransac_finds_the_planted_pose(wrong_share: float) -> None:
 def test_scaled_ransac_finds_the_planted_pose_and_scale(unit: float) -> None:
     """Metres per unit, not units per metre."""
     cameras = planted(random_for("scaled", unit), (60, 60, 60), 0.5, unit)
-    found = scaled_ransac(cameras, PNP, 2000, 600)
+    found = scaled_ransac(cameras, replace(PNP, max_iterations=2000, max_matches=600))
     assert found is not None
     assert found.scale == pytest.approx(unit, rel=0.03)
     assert_pose_close(RigidTransform(found.rotation, found.translation), TURNED_RIG, metres=0.05, degrees=0.5)
@@ -344,11 +345,11 @@ def test_scaled_ransac_finds_the_planted_pose_and_scale(unit: float) -> None:
 def test_too_few_matches_have_no_pose(counts: tuple[int, ...]) -> None:
     cameras = planted(random_for("few"), counts)
     assert rig_ransac(cameras, PNP) is None
-    assert not cameras or scaled_ransac(cameras, PNP, 100, 600) is None
+    assert not cameras or scaled_ransac(cameras, QUICK) is None
 
 
 def test_one_camera_alone_has_no_scale() -> None:
-    assert scaled_ransac(planted(random_for("one"), (50,)), PNP, 100, 600) is None
+    assert scaled_ransac(planted(random_for("one"), (50,)), QUICK) is None
 
 
 def test_the_same_matches_give_the_same_bits_for_any_rng_state() -> None:
@@ -359,7 +360,7 @@ def test_the_same_matches_give_the_same_bits_for_any_rng_state() -> None:
     def poses(drawn: int) -> list[bytes]:
         for _ in range(drawn):
             libc.rand()
-        rigid, scaled = rig_ransac(cameras, PNP), scaled_ransac(cameras, PNP, 50, 600)
+        rigid, scaled = rig_ransac(cameras, PNP), scaled_ransac(cameras, QUICK)
         assert rigid is not None
         assert scaled is not None
         return [it.tobytes() for it in (rigid.matrix(), scaled.rotation, scaled.translation, np.float64(scaled.scale))]

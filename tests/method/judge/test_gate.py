@@ -106,11 +106,13 @@ def test_guided_and_other_matches_have_their_own_chance() -> None:
     index = np.arange(100)
     free = PointMatches(index, index, np.zeros(100, bool), 0.0)
     share = math.pi * disc / (CAMERA.width_px * CAMERA.height_px)
-    assert log10_false_alarms(CAMERA, free, inliers, INLIER_PX) == pytest.approx(false_alarms(100, 40, share))
+    assert log10_false_alarms([(CAMERA, free, inliers)], INLIER_PX) == pytest.approx(false_alarms(100, 40, share))
     guided = PointMatches(index, index, np.ones(100, bool), 20.0)
-    assert log10_false_alarms(CAMERA, guided, inliers, INLIER_PX) == pytest.approx(false_alarms(100, 40, disc / 400))
+    assert log10_false_alarms([(CAMERA, guided, inliers)], INLIER_PX) == pytest.approx(
+        false_alarms(100, 40, disc / 400)
+    )
     both = PointMatches(index, index, index % 2 == 0, 20.0)
-    assert log10_false_alarms(CAMERA, both, inliers, INLIER_PX) == pytest.approx(
+    assert log10_false_alarms([(CAMERA, both, inliers)], INLIER_PX) == pytest.approx(
         min(false_alarms(50, 20, share), false_alarms(50, 20, disc / 400))
     )
 

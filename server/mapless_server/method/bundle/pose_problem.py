@@ -36,7 +36,7 @@ from mapless_server.bounds import check_bounds
 from ..features.limits import INLIER_PX
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import MinimizeOptions, columns, minimize
-from ..structure.model import PointMatches, Structure
+from ..structure.model import MIN_ADDED_SHARE, PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, free_problem
 from .dispersion import UncertaintyOptions, disperse, dispersed_covariance
@@ -112,7 +112,7 @@ class AdjustOptions:
     contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
     agreeing_share: float = 0.6
     rounds: int = 4
-    min_added_share: float = 0.4
+    min_added_share: float = MIN_ADDED_SHARE
     query_points: StructureOptions = field(default_factory=StructureOptions)
     uncertainty: UncertaintyOptions = field(default_factory=UncertaintyOptions)
 

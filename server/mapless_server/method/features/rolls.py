@@ -30,14 +30,8 @@ NEAR_SHARE = 0.05
 MAX_SCALE = 8.0
 """Photographs that show something in sizes that differ more have no matches: wrong ones end in one patch of texture."""
 
-LEAST_ACROSS = 0.5
-"""A direction shows the roll of a camera if so much of its unit vector is across the optical axis."""
-
 LEAST_AGREEMENT = 4.5
 """Matches show a roll if they have at least this agreement. Evidence: place-agreement."""
-
-LARGEST_SWING_DEG = 60.0
-"""Cameras whose optical axes are further apart hardly show the same, and their roll means less the further they are."""
 
 
 class Similarity(NamedTuple):
@@ -83,17 +77,17 @@ def roll_of_rotation(reference_from_query: Array) -> float | None:
     """The roll, degrees clockwise, of a camera by its rotation (3, 3) in another's frame: that about the optical axis.
 
     Swing-twist decomposition: the twist about z is what is left when the optical axis is turned the shortest way. None
-    if that turns it by more than `LARGEST_SWING_DEG`.
+    if that turns it by more than 60 degrees: such cameras hardly show the same.
     """
     r = reference_from_query
-    if r[2, 2] < math.cos(math.radians(LARGEST_SWING_DEG)):
+    if r[2, 2] < 0.5:
         return None
     return math.degrees(math.atan2(r[1, 0] - r[0, 1], r[0, 0] + r[1, 1]))
 
 
 def roll_of_directions(in_query: Array, in_reference: Array) -> float | None:
-    """The roll, degrees clockwise, of a direction (3,) seen in two cameras; None where one looks along it."""
-    if min(np.hypot(*in_query[:2]), np.hypot(*in_reference[:2])) < LEAST_ACROSS:
+    """The roll, degrees clockwise, of a direction (3,) seen in two cameras; None within 30 degrees of an axis."""
+    if min(np.hypot(*in_query[:2]), np.hypot(*in_reference[:2])) < 0.5:
         return None
     return math.degrees(math.atan2(in_reference[1], in_reference[0]) - math.atan2(in_query[1], in_query[0]))
 

@@ -20,7 +20,7 @@ from ..judge.hints import FEW_MATCHES, MANY_MATCHES
 from ..pairs.readings.conventions import CONVENTIONS, Convention
 from ..pairs.readings.explanation import MOST_NAMED
 from ..rejection import Advice, Hint, Rejection, RejectionReason
-from .jumps import ALL_JUMPS, find_jumps
+from .jumps import ALL_JUMPS, OTHER_UNIT, find_jumps
 from .rig import RigEstimate
 from .sequence import SequenceEstimate
 from .start import CHECK_TRACKING, STAGE
@@ -30,12 +30,6 @@ SURE_INLIERS = 30
 
 KEPT_SHARE = 0.25
 """Least share of these inliers in the rig's pose: with the right mounting nearly all are kept, with a wrong one few."""
-
-UNIT_TOLERANCE = 1.25
-"""Drift changes the length of a path by some per cent; wrong units are feet, centimetres, or an unknown scale."""
-
-LEAST_READ = 2
-"""A single step of a device that has jumped may agree with another reading of its poses by chance."""
 
 _FIRST = 4
 """Photographs that most readings contradict, in a twentieth of the time that sixteen take."""
@@ -70,11 +64,12 @@ def check_tracking(
     """Checks that the session agrees with the photographs somewhere; `unit` is the scene's, in messages.
 
     It does not in wrong axes, inverse, or in a unit that is wrong by far. Returns a rejection GATE if all of
-    `ALL_JUMPS` steps or more are jumps; or `LEAST_READ` or more, none of which is one if the session's poses are read
+    `ALL_JUMPS` steps or more are jumps; or two or more, none of which is one if the session's poses are read
     otherwise: the message then says how.
     """
     poses, count = estimate.world_from_camera, len(estimate.jumps)
-    readings = _fitting_readings(estimate, session_from_camera) if count >= LEAST_READ else []
+    # A single step of a device that has jumped may agree with another reading of its poses by chance.
+    readings = _fitting_readings(estimate, session_from_camera) if count >= 2 else []
     if count < max(len(poses) - 1, ALL_JUMPS) and not readings:
         return estimate
     tracked, shown_m = (sum(_distance(*ends) for ends in pairwise(it)) for it in (session_from_camera, poses))
@@ -131,7 +126,7 @@ def check_unit(
     if abs(path_m - tracked_m) <= SIGNIFICANT_SIGMAS * sigma_m or tracked_m * path_m == 0:
         return estimate
     unit_m = path_m / tracked_m
-    if 1 / UNIT_TOLERANCE <= unit_m <= UNIT_TOLERANCE:
+    if 1 / OTHER_UNIT <= unit_m <= OTHER_UNIT:
         return estimate
     message = (
         f"the session's path is {tracked_m:.2f} long, that of the photographs {path_m:.2f} {unit}: its unit is "

@@ -15,27 +15,25 @@ from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import Support, observers
 from ..bundle.priors import NO_PRIORS, Priors
+from ..features.limits import INLIER_PX
 from ..judge.answer import Answer, Localization
 from ..judge.evidence import findable_count, hull_share
 from ..judge.references import moved_matches, without
+from ..judge.two_view import MIN_HULL_SHARE
+from ..options import DoubtOptions
 from ..pairs.stationary import StationaryOptions
 from ..pose.generalized import CameraMatches
-from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, MIN_MATCHES, PnpOptions, false_alarms, format_false_alarms
+from ..pose.pnp import MIN_MATCHES, failure_by_chance, log10_false_alarms
 from ..rejection import Rejection, RejectionReason
 from ..structure.match import MatchOptions, search
 from ..structure.model import PointMatches, ScaleSource
 
-INLIER_PX = PnpOptions().inlier_px
-"""Largest reprojection error of an inlier, as for one photograph."""
-
 MIN_FOUND_SHARE = 0.08
-"""Least share of inliers among the points inside the images, or among the photographs' features if they are fewer."""
+"""Least share of inliers among the points inside the images, or among the photographs' features if they are fewer.
 
-ENOUGH_INLIERS = 100
-"""So many inliers are enough for any share: with many references the structure extends far beyond one photograph."""
-
-MIN_HULL_SHARE = 0.04
-"""Least share of an image covered by the convex hulls of the inliers."""
+With many references the structure extends far beyond one photograph, so `DoubtOptions.inliers` are enough for any
+share. Evidence: group-gate.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,11 +190,11 @@ def group_gate_failure(matched: Sequence[PosedImage]) -> str | None:
     moved = [it.moved() for it in matched]
     unmoved_count = inlier_total - sum(int(it.inliers.sum()) for it in moved)
     for some, begin in ((matched, count), (moved, f"{count}; {without(unmoved_count)} {_agreeing(moved)}")):
-        expected = group_log10_false_alarms(some)
-        if expected > MAX_LOG10_FALSE_ALARMS:
-            return f"{begin}, which chance could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
+        photographs = [(it.source.query.camera, it.matches, it.inliers) for it in some]
+        if failure := failure_by_chance(begin, log10_false_alarms(photographs, INLIER_PX)):
+            return failure
     visible = sum(it.findable_count() for it in matched)
-    if inlier_total < min(MIN_FOUND_SHARE * visible, ENOUGH_INLIERS):
+    if inlier_total < min(MIN_FOUND_SHARE * visible, DoubtOptions.inliers):
         return f"{count}, but they should show {visible} points: repeated structure somewhere else, most likely"
     covered = sum(it.hull_share() for it in matched)
     if covered < MIN_HULL_SHARE:
@@ -207,21 +205,6 @@ def group_gate_failure(matched: Sequence[PosedImage]) -> str | None:
 def _agreeing(matched: Sequence[PosedImage]) -> str:
     """How many of the matches are inliers, for a message."""
     return f"{sum(int(it.inliers.sum()) for it in matched)} of {sum(len(it.matches) for it in matched)} matches"
-
-
-def group_log10_false_alarms(matched: Sequence[PosedImage]) -> float:
-    """`pnp.log10_false_alarms` of all matches, with the largest chance of an inlier of any photograph."""
-    disc = INLIER_PX**2
-    guided = np.concatenate([it.matches.guided for it in matched])
-    inliers = np.concatenate([it.inliers for it in matched])
-    cameras = [it.source.query.camera for it in matched]
-    # Areas in which a match was searched, square pixels divided by pi.
-    of_image = min(it.width_px * it.height_px / np.pi for it in cameras)
-    near_point = min(it.matches.radius_px**2 for it in matched)
-    return min(
-        false_alarms(int(chosen.sum()), int((inliers & chosen).sum()), disc / max(area, disc))
-        for chosen, area in ((~guided, of_image), (guided, near_point))
-    )
 
 
 def _is_of_network(answer: Answer) -> bool:

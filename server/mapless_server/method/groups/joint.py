@@ -22,9 +22,6 @@ from ..structure.model import PointMatches
 from .images import MatchedImage, PosedImage
 from .problem import ADJUST, GroupProblem, GroupState, S
 
-ROUNDS = 2
-"""Rounds of searching matches and adjusting; the second starts from better poses."""
-
 STEPS = MinimizeOptions(15, ADJUST.min_decrease)
 """Drift needs more of them than one photograph's pose."""
 
@@ -55,7 +52,7 @@ def adjust_in_rounds(
     matched_images: Sequence[MatchedImage], state: S, priors: Mapping[int, Priors] | None = None
 ) -> JointEstimate[S]:
     """Alternates guided searches from the current poses with adjustments; then uses the priors that agree."""
-    for _ in range(ROUNDS):
+    for _ in range(2):  # the second search starts from better poses
         poses = [state.camera_from_world(it.image).inverse() for it in matched_images]
         matches = [it.matches_at(pose) for it, pose in zip(matched_images, poses, strict=True)]
         estimate = adjust_jointly(matched_images, matches, state)

@@ -67,9 +67,11 @@ ALL_JUMPS = 3
 UNIT_STEP = 1.005
 """Units that an unknown unit is tried from differ by at least this factor; it is less than drift of 1.2 %."""
 
-OTHER_UNIT, CERTAIN_COST = 1.25, 0.5
-"""The jumps of a session in an unknown unit are certain if the chains in units that differ by this factor cost more by
-at least so many thresholds."""
+OTHER_UNIT = 1.25
+"""Factor by which units differ: drift changes the length of a path by some per cent, a wrong unit by more."""
+
+CERTAIN_COST = 0.5
+"""The jumps of a session in an unknown unit are certain if chains in other units cost more by so many thresholds."""
 
 
 @dataclass(frozen=True, eq=False)

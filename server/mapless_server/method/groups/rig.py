@@ -13,8 +13,10 @@ from mapless.geometry import Array, RigidTransform, cross_matrix
 
 from ..bundle.priors import PriorCheck
 from ..optim.optimize import covariance_in_world, perturbed
+from ..options import LocalizeOptions
 from ..pose.generalized import inlier_count, rig_ransac
 from ..pose.pnp import PnpOptions
+from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection, RejectionReason
 from .images import (
     GroupImage,
@@ -82,7 +84,7 @@ class RigState(GroupState):
 
 
 def solve_rig(
-    images: Sequence[GroupImage], rig_from_camera: Sequence[RigidTransform], coverage: float = 0.95
+    images: Sequence[GroupImage], rig_from_camera: Sequence[RigidTransform], coverage: float = LocalizeOptions.coverage
 ) -> RigEstimate | Rejection:
     """Estimates the pose of a rig from the photograph of each camera, with its own answer and metric pose in the rig.
 
@@ -102,7 +104,7 @@ def solve_rig(
         return start
     state = RigState(start.inverse(), tuple(rig_from_camera))
     estimate = adjust_in_rounds(matched_images, state, priors_of(images, origin))
-    if estimate.inlier_count < 4:
+    if estimate.inlier_count < MIN_INLIERS:
         return Rejection(RejectionReason.PNP_FAILED, "no pose of the rig explains four matches")
     if failure := group_gate_failure(estimate.matched):
         return Rejection(RejectionReason.GATE, failure)
@@ -125,7 +127,7 @@ def _start(
         it.own_pose.compose(rig_from_camera[it.image].inverse()) for it in matched_images if it.own_pose is not None
     ]
     counts = [inlier_count(cameras, pose, PNP.inlier_px) for pose in candidates]
-    if max(counts, default=0) < 4:
+    if max(counts, default=0) < MIN_INLIERS:
         message = f"no pose of the rig explains more than {max(counts, default=0)} of {sum(map(len, cameras))} matches"
         return Rejection(RejectionReason.PNP_FAILED, message)
     return candidates[int(np.argmax(counts))]

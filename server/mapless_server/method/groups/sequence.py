@@ -17,7 +17,10 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import PriorCheck, Priors
+from ..features.limits import LOOSE_PX
 from ..optim.optimize import covariance_in_world
+from ..options import LocalizeOptions
+from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection, RejectionReason
 from .drift import SequenceState, world_from_session_at
 from .images import (
@@ -32,7 +35,7 @@ from .images import (
 )
 from .joint import JointEstimate, adjust_in_rounds
 from .jumps import Jump
-from .start import LOOSE_PX, Session, Start
+from .start import Session, Start
 from .trust import trust_of_group
 
 SHOULD_SHOW, LEAST_NEAR = 15, 3
@@ -77,7 +80,7 @@ def solve_sequence(
     images: Sequence[GroupImage],
     session_from_camera: Sequence[RigidTransform],
     estimate_scale: bool,
-    coverage: float = 0.95,
+    coverage: float = LocalizeOptions.coverage,
     unit: str = "m",
 ) -> SequenceEstimate | Rejection:
     """Estimates the poses of a sequence: frames in the order they were taken, with their own answers and tracked poses.
@@ -133,7 +136,7 @@ def _judged(
     estimate: JointEstimate[SequenceState], last_part: Sequence[PosedImage], coverage: float
 ) -> tuple[float, Rejection | None]:
     """The trust in the photographs since the last jump; a rejection if they, or the scale, do not support the poses."""
-    if sum(int(it.inliers.sum()) for it in last_part) < 4:
+    if sum(int(it.inliers.sum()) for it in last_part) < MIN_INLIERS:
         return 0.0, Rejection(RejectionReason.PNP_FAILED, "no poses of the sequence explain four matches")
     if failure := group_gate_failure(last_part):
         return 0.0, Rejection(RejectionReason.GATE, failure)

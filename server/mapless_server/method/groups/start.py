@@ -13,8 +13,11 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import Priors
+from ..features.limits import LOOSE_PX
+from ..judge.evidence import PNP as QUICK_PNP
 from ..pose.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from ..pose.pnp import PnpOptions
+from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .drift import world_from_session_at
 from .images import MatchedImage
@@ -33,14 +36,8 @@ CHECK_TRACKING = Hint(
 PNP = PnpOptions()
 """Options of the pose solvers; `MIN_MATCHES` holds for all frames together."""
 
-LOOSE_PX = 12.0
-"""Inlier bound for initial guesses, which drift."""
-
 MIN_MOTION = 1e-6
 """Least extent of a session of unknown unit, as a share of its distance from its own origin; less is rounding."""
-
-SCALE_ITERATIONS, SCALE_MATCHES = 1000, 600
-"""Samples of the RANSAC for pose and scale, and matches on which they are scored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +128,11 @@ class Session:
     def _of_all_matches(self, cameras: Sequence[CameraMatches]) -> Similarity | None:
         """Estimates `world_from_session` of the whole sequence as one camera; None if no pose explains four matches."""
         if self.scale_is_free:
-            guess = scaled_ransac(cameras, PNP, SCALE_ITERATIONS, SCALE_MATCHES)
+            guess = scaled_ransac(cameras, QUICK_PNP)
         else:
             rigid = rig_ransac(cameras, PNP)
             guess = None if rigid is None else Similarity(1.0, rigid.rotation, rigid.translation)
-        if guess is None or inlier_count(cameras, guess, LOOSE_PX) < 4:
+        if guess is None or inlier_count(cameras, guess, LOOSE_PX) < MIN_INLIERS:
             return None
         return guess
 
@@ -156,8 +153,10 @@ class Session:
             step = max(
                 range(jump.before, jump.after), key=lambda k: sum(earlier[: k - jump.before] + later[k - jump.before :])
             )
-            before = max((i for i in between if i <= step and earlier[i - between[0]] >= 4), default=jump.before)
-            after = min((i for i in between if i > step and later[i - between[0]] >= 4), default=jump.after)
+            before = max(
+                (i for i in between if i <= step and earlier[i - between[0]] >= MIN_INLIERS), default=jump.before
+            )
+            after = min((i for i in between if i > step and later[i - between[0]] >= MIN_INLIERS), default=jump.after)
             jumps.append(replace(jump, before=before, after=after))
             cut.append(step)
         part = np.searchsorted(cut, np.arange(len(self.frames)), side="left")

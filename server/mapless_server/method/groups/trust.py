@@ -27,6 +27,7 @@ from ..judge.evidence import (
 from ..judge.judge import JudgeOptions, low_trust, trust_of
 from ..judge.references import Supporters, disagreeing_references
 from ..pose.generalized import CameraMatches, rig_ransac
+from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection
 from .images import PosedImage
 
@@ -131,7 +132,7 @@ def _median_disagreement(
             if keypoints is not None:
                 rows = [r[np.unique(k[r], return_index=True)[1]] for r, k in zip(rows, keypoints, strict=True)]
             some = [it[r] for it, r in zip(cameras, rows, strict=True) if len(r)]
-            pose = rig_ransac(some, PNP) if sum(map(len, rows)) >= 4 else None
+            pose = rig_ransac(some, PNP) if sum(map(len, rows)) >= MIN_INLIERS else None
             centres.append(None if pose is None else pose.translation)
         first, second = centres
         apart.append(NO_AGREEMENT if first is None or second is None else math.dist(first, second) / distance_m)

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 
 from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance, with_halves
+from ..features.limits import LOOSE_PX
 from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.one_reference import Found
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
@@ -53,10 +54,6 @@ RIVAL_MIN_OWN_SHARE = 0.5
 
 MIN_APART_M, MIN_APART_DEG = 0.1, 5.0
 """Poses nearer than this are one place, independent of their radii."""
-
-AGREEING_PX = 12.0
-"""Matches within this distance belong to the first pose; larger than the inlier bound, since a point with an error is
-not a second place."""
 
 RIVAL_PNP = PnpOptions(min_iterations=50, max_iterations=200, max_matches=300)
 """RANSAC of the rival's pose; the few iterations find a pose with a third of the matches as inliers."""
@@ -253,7 +250,7 @@ def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, Pos
     errors_px = votes.seen.errors_px(estimate.world_from_camera)
     own = errors_px < RIVAL_PNP.inlier_px
     wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(RIVAL_MIN_SHARE * votes.keypoint_count(own))))
-    candidates = _outliers(votes, own, ~(errors_px < AGREEING_PX), len(support.references))
+    candidates = _outliers(votes, own, ~(errors_px < LOOSE_PX), len(support.references))
     if votes.keypoint_count(candidates) < wanted:
         return None
     rival = _second_pose(camera, votes[candidates], wanted)

@@ -234,7 +234,7 @@ def minimize_each(
         better = candidate_cost <= least  # False for NaN: behind a camera, or a singular system
         x = np.where(better, candidate, x)
         least = np.where(better, candidate_cost, least)
-        damped = np.where(better, damped * LOWERED, damped * 10)
+        damped = np.where(better, damped * LOWERED, damped * MinimizeOptions.raised_by)
     return x
 
 

@@ -24,6 +24,7 @@ from mapless.geometry import Array, RigidTransform, Similarity
 from ..features.views import Rows
 from ..structure.model import PixelPoints
 from .pnp import REFINEMENT, PnpOptions, inverse_of, iterations_between, poselib_camera, poselib_pose
+from .with_priors import samples_needed
 
 _libc = ctypes.CDLL(None)
 _rand_lock = threading.Lock()
@@ -81,16 +82,13 @@ def rig_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> RigidTr
     return inverse_of(pose)
 
 
-def scaled_ransac(
-    cameras: Sequence[CameraMatches], options: PnpOptions, max_iterations: int, max_matches: int
-) -> Similarity | None:
+def scaled_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> Similarity | None:
     """Estimates the similarity `world_from_rig` by gp4ps in our own RANSAC; PoseLib has the solver, but no estimator.
 
-    `rig_from_camera` of the cameras is in any common unit. Poses are scored on at most `max_matches`, thinned evenly.
-    Returns the pose with the most inliers; None if there is none with a scale above zero, which cameras at one place do
-    not determine.
+    `rig_from_camera` of the cameras is in any common unit. Returns the pose with the most inliers; None if none has a
+    scale above zero, which cameras at one place do not determine.
     """
-    cameras = _bounded(cameras, max_matches)
+    cameras = _bounded(cameras, options.max_matches)
     rays = np.concatenate([_rays(camera) for camera in cameras])
     starts = np.concatenate(
         [np.broadcast_to(camera.rig_from_camera.translation, (len(camera), 3)) for camera in cameras]
@@ -99,8 +97,8 @@ def scaled_ransac(
     owner = np.repeat(np.arange(len(cameras)), [len(camera) for camera in cameras])
     if len(points) < 4 or len(np.unique(owner)) < 2:
         return None
-    random, best, best_count, needed = np.random.default_rng(0), None, 3, max_iterations
-    for iteration in range(max_iterations):
+    random, best, best_count, needed = np.random.default_rng(0), None, 3, math.inf
+    for iteration in range(options.max_iterations):
         if iteration >= needed:
             break
         sample = random.choice(len(points), 4, replace=False)
@@ -113,7 +111,7 @@ def scaled_ransac(
             count = inlier_count(cameras, world_from_rig, options.inlier_px) if world_from_rig else 0
             if count > best_count:
                 best, best_count = world_from_rig, count
-                needed = _iterations_needed(count / len(points))
+                needed = samples_needed((count / len(points)) ** 4 / 2)  # half of all samples are of a single camera
     return best
 
 
@@ -123,12 +121,6 @@ def _repeatable() -> Iterator[None]:
     with _rand_lock:
         _libc.srand(0)
         yield
-
-
-def _iterations_needed(inlier_share: float) -> int:
-    """Number of samples of which one has four inliers with 99.9 %, if half of all are of a single camera."""
-    good = inlier_share**4 / 2
-    return 2 if good >= 1 else math.ceil(math.log(1e-3) / math.log1p(-good))
 
 
 def _bounded(cameras: Sequence[CameraMatches], max_matches: int) -> list[CameraMatches]:

@@ -7,6 +7,7 @@ The gate: a pose must have more inliers than wrong matches can be expected to gi
 and Stival 2004). Wrong matches of repeated texture agree with one another and pass it; `judge` rejects these.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +25,8 @@ from ..features.views import View
 from ..optim.optimize import pose_hessian, world_covariance
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import PixelPoints, PointMatches, Structure
-from .with_priors import informed_pose
+from ..structure.observations import MIN_NOISE_LEVEL_PX
+from .with_priors import MIN_INLIERS, informed_pose
 
 SAMPLE, SAMPLE_INLIERS, SAMPLE_ITERATIONS = 80, 32, 300
 """Matches that RANSAC sees first, the least inliers among them, and the largest number of iterations: so many find a
@@ -109,11 +111,11 @@ def _estimate(
     """The estimate of a pose, with inliers, errors and covariance; PNP_FAILED for fewer than four inliers."""
     errors_px = seen.errors_px(pose)
     inliers = errors_px < options.inlier_px
-    if inliers.sum() < 4:
+    if inliers.sum() < MIN_INLIERS:
         message = f"no pose explains more than {inliers.sum()} of {len(seen)} matches"
         return Rejection(RejectionReason.PNP_FAILED, message)
     # Of half-normal lengths in two dimensions the median is sqrt(2 ln 2) sigma.
-    sigma_px = max(0.1, float(np.median(errors_px[inliers])) / np.sqrt(2 * np.log(2)))
+    sigma_px = max(MIN_NOISE_LEVEL_PX, float(np.median(errors_px[inliers])) / np.sqrt(2 * np.log(2)))
     covariance = world_covariance(pose_hessian(seen.camera, pose, seen.x_in_world[inliers]) / sigma_px**2, pose)
     return PoseEstimate(pose, stage, inliers, errors_px, covariance)
 
@@ -134,15 +136,15 @@ def ransac(seen: PixelPoints, world_from_camera: RigidTransform | None, options:
             min_iterations=min(options.min_iterations, SAMPLE_ITERATIONS),
             max_iterations=min(options.max_iterations, SAMPLE_ITERATIONS),
         )
-        pose, count = _ransac(seen[sample], initial, brief, refinement_steps=0)
+        pose, count = _ransac(seen[sample], initial, brief, {"max_iterations": 0})
         pose = _refined(seen, pose, options) if count >= SAMPLE_INLIERS else None
     if pose is None:
-        pose, _ = _ransac(seen, initial, options, refinement_steps=100)
+        pose, _ = _ransac(seen, initial, options, REFINEMENT)
     return inverse_of(pose)
 
 
 def _ransac(
-    seen: PixelPoints, initial: poselib.CameraPose | None, options: PnpOptions, refinement_steps: int
+    seen: PixelPoints, initial: poselib.CameraPose | None, options: PnpOptions, refinement: Mapping[str, object]
 ) -> tuple[poselib.CameraPose, int]:
     """PoseLib's RANSAC: the pose, and its number of inliers."""
     pose, found = poselib.estimate_absolute_pose(
@@ -150,7 +152,7 @@ def _ransac(
         seen.x_in_world,
         poselib_camera(seen.camera),
         {"max_reproj_error": options.inlier_px, **iterations_between(options.min_iterations, options.max_iterations)},
-        {**REFINEMENT, "max_iterations": refinement_steps},
+        dict(refinement),
         initial,
     )
     return pose, int(found.get("num_inliers", 0))
@@ -211,25 +213,34 @@ def gate_failure(
     At least four of the matches with points are `inliers` (M,) of the pose, with errors up to `inlier_px`. For
     `log10_chance` see `Priors.log10_chance`; the sentence has the matches `named` so.
     """
-    expected = log10_false_alarms(camera, matches, inliers, inlier_px) + log10_chance
-    if expected <= MAX_LOG10_FALSE_ALARMS:
+    expected = log10_false_alarms([(camera, matches, inliers)], inlier_px) + log10_chance
+    return failure_by_chance(f"{inliers.sum()} of {len(matches)} {named} agree on a pose", expected)
+
+
+def failure_by_chance(count: str, log10_expected: float) -> str | None:
+    """Says, after the `count` of matches that agree, that chance could do it; None if it could not."""
+    if log10_expected <= MAX_LOG10_FALSE_ALARMS:
         return None
-    count = f"{inliers.sum()} of {len(matches)} {named} agree on a pose"
-    return f"{count}, which chance could do ({format_false_alarms(expected, MAX_LOG10_FALSE_ALARMS)})"
+    return f"{count}, which chance could do ({format_false_alarms(log10_expected, MAX_LOG10_FALSE_ALARMS)})"
 
 
-def log10_false_alarms(camera: Camera, matches: PointMatches, inliers: NDArray[np.bool_], inlier_px: float) -> float:
-    """log10 of the expected number of poses with as many inliers among random matches.
+def log10_false_alarms(
+    photographs: Sequence[tuple[Camera, PointMatches, NDArray[np.bool_]]], inlier_px: float
+) -> float:
+    """log10 of the expected number of poses with as many inliers among random matches of all photographs.
 
-    The chance of an inlier is the share of its disc in the image for matches found in the whole image, and in the
-    search circle for guided matches. The smaller of the two groups' results is returned.
+    These are given by camera, matches and inliers (M,). The chance of an inlier is the share of its disc in the image
+    for matches found in the whole image, and in the search circle for guided matches, the largest of any photograph.
+    The smaller of the two groups' results is returned.
     """
     disc = inlier_px**2
-    area = camera.width_px * camera.height_px / np.pi
-    guided = matches.guided
+    guided, inliers = (np.concatenate(it) for it in zip(*((m.guided, i) for _, m, i in photographs), strict=True))
+    # Areas in which a match was searched, square pixels divided by pi.
+    of_image = min(it.width_px * it.height_px / np.pi for it, _, _ in photographs)
+    near_point = min(it.radius_px**2 for _, it, _ in photographs)
     return min(
-        false_alarms(int((~guided).sum()), int((inliers & ~guided).sum()), disc / area),
-        false_alarms(int(guided.sum()), int((inliers & guided).sum()), disc / max(matches.radius_px**2, disc)),
+        false_alarms(int(chosen.sum()), int((inliers & chosen).sum()), disc / max(area, disc))
+        for chosen, area in ((~guided, of_image), (guided, near_point))
     )
 
 

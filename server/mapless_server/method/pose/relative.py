@@ -36,13 +36,10 @@ from .pnp import (
     poselib_pose,
     ransac,
 )
-from .two_view_matches import TwoViewMatches
+from .two_view_matches import MIN_TWO_VIEW, TwoViewMatches
 
 PNP = PnpOptions()
 """Options of poses from 2D-3D matches, and the bound of their inliers."""
-
-MIN_PAIR_MATCHES = 8
-"""Least number of matches with a reference, for its relative pose."""
 
 MAX_DISTANCES = 200
 """Largest number of distances that are scored for each reference, evenly thinned."""
@@ -59,7 +56,7 @@ class RelativePoseOptions:
     """
 
     min_iterations: int = 1000
-    max_iterations: int = 20_000
+    max_iterations: int = PnpOptions.max_iterations
     pair_iterations: int = 5000
     strongest: int = 2
 
@@ -177,7 +174,7 @@ def _strongest(two_view: TwoViewMatches, options: RelativePoseOptions) -> list[i
     """Indices of the references with the most matches."""
     counts = np.bincount(two_view.reference)
     order = np.argsort(-counts, kind="stable")[: options.strongest]
-    return [int(it) for it in order if counts[it] >= MIN_PAIR_MATCHES]
+    return [int(it) for it in order if counts[it] >= MIN_TWO_VIEW]
 
 
 def _by_distance(evidence: Evidence, reference: int, options: RelativePoseOptions) -> RigidTransform | None:

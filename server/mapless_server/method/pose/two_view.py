@@ -25,16 +25,10 @@ from ..structure.match import MatchOptions, match_points, vote
 from ..structure.model import PointMatches, Structure
 from ..structure.structure import StructureOptions, triangulated_structure
 from .relative import Evidence, RelativePoseOptions, find_pose, score
-from .two_view_matches import TwoViewMatches
-
-MIN_PARALLAX_DEG = 0.5
-"""Matches with a smaller parallax are not adjusted: their points have no depth."""
+from .two_view_matches import MIN_TWO_VIEW, TwoViewMatches
 
 ROUNDS = 3
 """Rounds of choosing inliers and adjusting."""
-
-MIN_INLIERS = 8
-"""Fewer matches do not determine a pose with any redundancy."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +68,7 @@ def solve_two_view(
         if adjusted is None or (best.estimate is not None and adjusted.score <= best.score):
             break
         best = adjusted
-    if best.estimate is None or best.inlier_count < MIN_INLIERS:
+    if best.estimate is None or best.inlier_count < MIN_TWO_VIEW:
         return None
     return PosedSupport(
         query,
@@ -140,7 +134,8 @@ class _Problem:
 
     def adjusted(self, start: _Solution) -> _Solution | None:
         """Adjusts over the inliers of both kinds; None if that fails."""
-        used = start.support.inliers & (start.parallax_deg >= MIN_PARALLAX_DEG)
+        # Points with a smaller parallax have no depth.
+        used = start.support.inliers & (start.parallax_deg >= StructureOptions.min_parallax_deg)
         support, rows = start.support, np.arange(used.sum(), dtype=np.intp)
         single = Tracks(rows, support.reference[used], support.reference_keypoint[used])
         structure = self.structure.and_last(support.x_in_world[used], single)

@@ -26,6 +26,9 @@ from ..features.views import Matches, PosedView, View
 from ..structure.observations import KeypointNoise, triangulate
 from ..structure.structure import observe
 
+MIN_TWO_VIEW = 8
+"""Fewer two-view matches do not determine a pose with any redundancy."""
+
 
 @dataclass(frozen=True, eq=False)
 class TwoViewMatches:

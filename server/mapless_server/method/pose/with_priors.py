@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
+from ..bundle.pose_problem import AdjustOptions
 from ..bundle.priors import NO_PRIORS, GravityPrior, PriorCheck, Priors
 from ..optim.optimize import (
     MinimizeOptions,
@@ -38,14 +39,13 @@ from ..structure.model import PixelPoints
 LOSS_SCALE_PX = 1.4
 """Scale c of the Cauchy loss; a right match has a standard deviation of one pixel."""
 
-PRIOR_WEIGHT = 4.0
-"""The factor w by which the matches have less information than if their errors were independent: the square of
-`AdjustOptions.error_inflation`."""
+PRIOR_WEIGHT = AdjustOptions.error_inflation**2
+"""The factor w by which the matches have less information than if their errors were independent."""
 
 STEPS = MinimizeOptions(iterations=10, min_decrease=1e-4)
 
 MIN_INLIERS = 4
-"""Fewer give no pose."""
+"""Fewer inliers give no pose: any three agree with one."""
 
 ENOUGH_INLIERS = 50
 """With so many no candidates from priors are tried: more than repeated structure gives a wrong pose."""
@@ -61,9 +61,11 @@ MAX_MATCHES = 300
 """Largest number for RANSAC with gravity, evenly thinned; more do not improve the choice, and scoring is linear in
 them."""
 
-BATCH, MAX_SAMPLES, CONFIDENCE = 64, 512, 0.999
-"""Samples that are scored together, and at most; and the probability that two right matches have been drawn with which
-it stops."""
+BATCH, MAX_SAMPLES = 64, 512
+"""Samples that are scored together, and at most."""
+
+CONFIDENCE = 0.999
+"""Probability that a sample of right matches has been drawn with which sampling stops."""
 
 REFINED = 3
 """Number of the best hypotheses that are refined."""
@@ -191,7 +193,7 @@ def ransac_with_gravity(
     rays = seen.camera.rays(seen.pixels)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     best, costs, inlier_share, drawn = np.zeros((0, 3, 4)), np.zeros(0), 0.0, 0
-    while drawn < min(_samples_needed(inlier_share), MAX_SAMPLES):
+    while drawn < min(samples_needed(inlier_share**2), MAX_SAMPLES):
         rotation, translation = solve_pairs(gravity, rays, seen.x_in_world, _pairs(rng, len(seen), BATCH))
         drawn += BATCH
         squared = _squared_errors(seen, rotation, translation)
@@ -242,10 +244,11 @@ def _pairs(rng: np.random.Generator, count: int, size: int) -> NDArray[np.int64]
     return np.stack([first, (first + rng.integers(1, count, size=size)) % count], axis=1)
 
 
-def _samples_needed(inlier_share: float) -> float:
-    """Number of samples after which two inliers have been drawn with probability `CONFIDENCE`."""
-    missed = 1 - inlier_share**2
-    return math.log(1 - CONFIDENCE) / math.log(missed) if 0 < missed < 1 else (math.inf if missed >= 1 else 1.0)
+def samples_needed(good_share: float) -> float:
+    """Number of samples after which a good one has been drawn with probability `CONFIDENCE`, if this share is good."""
+    if not 0 < good_share < 1:
+        return 1.0 if good_share >= 1 else math.inf
+    return math.log(1 - CONFIDENCE) / math.log1p(-good_share)
 
 
 def _squared_errors(seen: PixelPoints, rotation: Array, translation: Array) -> Array:

@@ -27,16 +27,9 @@ from ..features.views import PosedView
 from ..optim.optimize import cauchy_weight
 from ..pairs.correspond import Correspondences
 from .match import vote
-from .model import DepthPlanes, Structure
+from .model import MIN_ADDED_SHARE, DepthPlanes, Structure
 from .observations import keypoint_rays
-from .structure import observe
-
-MIN_ADDED_SHARE = 0.4
-"""Points at stored depths are added where there are so many for each match with a triangulated point; as
-`AdjustOptions.min_added_share`."""
-
-LOSS_SCALE_SIGMA = 2.0
-"""Scale of the Cauchy loss for common factors: depths are wrong at edges, and of what is reflected."""
+from .structure import StructureOptions, observe
 
 ITERATIONS = 6
 """Steps to a common factor, by reweighted least squares."""
@@ -118,7 +111,9 @@ def _without_common_factors(structure: Structure, references: Sequence[PosedView
         own_variance = reference.depths.relative_sigma**2
         values, variance, common = log_factor[seen], own_variance + relative_variance[seen], 0.0
         for _ in range(ITERATIONS):
-            weight = cauchy_weight((values - common) ** 2 / variance, LOSS_SCALE_SIGMA) / variance
+            # Depths are wrong at edges, and of what is reflected.
+            squared = (values - common) ** 2 / variance
+            weight = cauchy_weight(squared, StructureOptions.loss_scale_sigma) / variance
             common = float(weight @ values) / (float(weight.sum()) + 1 / own_variance)
         its_rows = slice(known.offsets[view], known.offsets[view + 1])
         depth[its_rows] /= np.exp(common)

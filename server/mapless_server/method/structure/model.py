@@ -18,6 +18,9 @@ if TYPE_CHECKING:  # services do not load what computes
     from ..features.views import Rows, View
     from .observations import KeypointNoise
 
+MIN_ADDED_SHARE = 0.4
+"""Points of the query's own matches are added where there are so many for each match with a triangulated point."""
+
 
 class ScaleStage(str, Enum):
     """The stage that gave the scale."""

@@ -15,10 +15,7 @@ from mapless_server.networks.local_features import load_edgepoint2
 
 from ..masks import usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
-from .network import LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
-
-WINDOW_PX = 5
-"""Side of the window in which a keypoint is the strongest pixel."""
+from .network import WINDOW_PX, LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
 
 SIZE_OF_WIDTH = 12.0
 """Size of a keypoint over the width of its peak along the flatter axis, the square root of the inverse curvature of the

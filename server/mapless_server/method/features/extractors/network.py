@@ -11,6 +11,9 @@ from mapless_server.bounds import check_bounds
 
 from ..limits import MAX_KEYPOINTS, MAX_SIDE_PX
 
+WINDOW_PX = 5
+"""Side of the window in which a keypoint is the strongest pixel."""
+
 
 @dataclass(frozen=True)
 class LearnedOptions:

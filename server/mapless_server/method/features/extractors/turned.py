@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera
 
+from ..limits import MAX_SIDE_PX
 from ..views import Features, Ignored, View, reduce_image, view_of
 from . import FeatureExtractor
-
-MAX_SIDE_PX = 2048
-"""Longer images are reduced before they are turned by another angle than quarters; extractors reduce them further."""
 
 
 def extract_turned(
@@ -30,7 +28,7 @@ def extract_turned(
     alike matches nothing, since the best match of a feature has to be clearly better than the second.
     """
     if any(angle_deg % 90 for angle_deg in clockwise_deg):  # a canvas of the whole image could be very large
-        image, camera = reduce_image(image, camera, MAX_SIDE_PX)
+        image, camera = reduce_image(image, camera, 2 * MAX_SIDE_PX)
     found = [_in_raster(extractor, image, camera, angle_deg, ignored) for angle_deg in clockwise_deg]
     processed = found[0].camera
     share = np.divide((processed.width_px, processed.height_px), (camera.width_px, camera.height_px))

@@ -13,13 +13,10 @@ from mapless_server.networks.local_features import load_xfeat
 
 from ..masks import usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
-from .network import LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
+from .network import WINDOW_PX, LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
 
 MULTIPLE_PX = 32
 """Sides of the images that the network takes."""
-
-WINDOW_PX = 5
-"""Side of the window in which a keypoint is the strongest pixel."""
 
 SHIFT_PX = 0.4
 """From a maximum of the keypoint map to the image point, right and down: the map has the pixel coordinates used here,

@@ -13,13 +13,11 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
 from ...features.views import PosedView
-from .errors import PairSample, summary
+from .errors import FEW_SHARE, PairSample, summary
 from .repeats import EXACT_DIGITS
 
 DIGITS = range(-4, 7)
 """Digits after the point that are tried, negative before it; of rotations those after it."""
-ROUNDED_SHARE = 0.3
-"""Least share of rotations that are of a rounded matrix: some need more steps to become one."""
 EXPLAINED_FACTOR = 3.0
 """Rounding explains errors that are at most so many times those that it makes."""
 
@@ -51,7 +49,7 @@ def _step(values: Array) -> float:
 def _rotation_step(poses: Sequence[RigidTransform]) -> float:
     for digits in range(1, DIGITS.stop):
         rounded = [_is_of_rounded_matrix(pose, digits) or _is_of_rounded_quaternion(pose, digits) for pose in poses]
-        if np.mean(rounded) >= ROUNDED_SHARE:
+        if np.mean(rounded) >= FEW_SHARE:  # a rounded matrix is not always nearest to the rotation made of it
             return 10.0**-digits
     return 0.0
 
