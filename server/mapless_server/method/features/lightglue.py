@@ -40,7 +40,7 @@ class LightGlueOptions:
 
 
 CONFIDENCES = 0.95, 0.99
-"""The authors' depth and width confidence, see `LightGlue.match_one`: 97 % of the matches in half the time."""
+"""The authors' depth and width confidence, see `LightGlue.match_one`, with which it takes half the time."""
 
 CPU_OPTIONS = LightGlueOptions(max_keypoints=MAX_KEYPOINTS // 2, pairs_at_once=1)
 CUDA_OPTIONS = LightGlueOptions(half=True)

@@ -13,8 +13,7 @@ from mapless.geometry import Array
 from .views import Ignored
 
 MARGIN_PX = 4.0
-"""Keypoints are at least so far from an ignored pixel, in the image that features are found in. Evidence:
-mask-margin."""
+"""Keypoints are at least so far from an ignored pixel, in the processed image. Evidence: mask-margin."""
 
 
 def usable_pixels(ignored: Ignored, width_px: int, height_px: int) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from mapless.geometry import Array
 from .views import Matches, View
 
 UPRIGHT_DEG = 20.0
-"""Learned features still match what is rolled by so much: EdgePoint2 1353 of 2048 at 15 degrees, 377 at 30."""
+"""Learned features still match what is rolled by so much. Evidence: upright."""
 
 ROUNDED_DEG = 5.0
 """Angles are rounded to this, so that slightly different matches lead to the same raster."""

@@ -29,10 +29,10 @@ SURE_INLIERS = 30
 """The pose of a photograph with so many inliers alone is reliable."""
 
 KEPT_SHARE = 0.25
-"""Least share of these inliers in the rig's pose: with the right mounting nearly all are kept, with a wrong one few."""
+"""Least share of these inliers that the rig's pose keeps; with the right mounting it keeps nearly all."""
 
 _FIRST = 4
-"""Photographs that most readings contradict, in a twentieth of the time that sixteen take."""
+"""So many photographs contradict most readings; the others are compared with the rest only."""
 
 SIGNIFICANT_SIGMAS = 4.0
 """Least difference of the path's lengths, in standard deviations."""

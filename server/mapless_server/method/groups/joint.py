@@ -23,7 +23,7 @@ from .images import MatchedImage, PosedImage
 from .problem import ADJUST, GroupProblem, GroupState, S
 
 STEPS = MinimizeOptions(15, ADJUST.min_decrease)
-"""Drift needs more of them than one photograph's pose."""
+"""Steps of an adjustment; drift needs more than one photograph's pose."""
 
 
 @dataclass(frozen=True, eq=False)

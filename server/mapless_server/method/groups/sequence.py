@@ -41,11 +41,11 @@ from .trust import trust_of_group
 SHOULD_SHOW, LEAST_NEAR = 15, 3
 """The last photograph, not localized alone, contradicts the pose that it is tracked to if so many points should be
 visible, or are matched, and fewer of its matches are near them, within `LOOSE_PX` and three standard deviations of the
-pose."""
+pose. Evidence: group-sequences."""
 
 INDEPENDENT = 2.0
 """Photographs of a sequence count as at most so many independent ones in the covariance of a pose: they share
-references, and with them points and their errors."""
+references, and with them points and their errors. Evidence: group-sequences."""
 
 MAX_SCALE_SIGMA = 0.15
 """Largest relative standard deviation of an accepted scale."""

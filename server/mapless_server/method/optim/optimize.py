@@ -141,7 +141,7 @@ LOWERED = 0.1
 """Factor on the damping after an accepted step."""
 
 MAX_DAMPING = 1e6
-"""Minimizing stops beyond it: the steps are then too short to matter."""
+"""Largest damping; the steps of a larger one are too short to matter."""
 
 LEAST_DIAGONAL = 1e-12
 """Added to the diagonal before it is damped: an unknown that is not determined stays where it is."""

@@ -15,8 +15,7 @@ from ..features.views import Matches, PosedView
 from .epipolar import MIN_MATCHES, QUICK_ITERATIONS, PosedMatches, fundamental_inliers
 
 MAX_ERROR_PX = 3.0
-"""Largest median error of a pair that agrees, pixels of an image whose longer side is 1024. Evidence:
-scene-agreement."""
+"""Largest median error of a pair that agrees, pixels of an image of `MAX_SIDE_PX`. Evidence: scene-agreement."""
 
 STATIONARY_PX = 35.0
 """The same for two references at one place, where only the rotation is compared: a camera turned by hand or on a tripod

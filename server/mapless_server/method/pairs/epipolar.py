@@ -26,12 +26,11 @@ from ..optim.optimize import cross_matrices
 FUNDAMENTAL_PX = 1.5
 """Largest distance from the epipolar lines of an estimated matrix; keypoints are accurate to about a pixel."""
 MIN_MATCHES = 24
-"""Fewer inliers of it are no evidence: any eight matches satisfy some fundamental matrix. Evidence:
-scene-agreement."""
+"""Fewer inliers of it are no evidence: any eight matches satisfy some fundamental matrix. Evidence: scene-agreement."""
 SAME_PLACE = 1e-6
 """Cameras that are nearer than this are at one place; in the unit of the poses."""
 MIN_BEFORE = 8
-"""Points that say whether they lie before the cameras."""
+"""Fewer points do not say whether they lie in front of the cameras."""
 
 MIN_PARALLAX_DEG = 1.0
 """Rays of a smaller angle determine no depth: an error of a pixel changes it by several per cent."""

@@ -52,7 +52,7 @@ SHARED_MATCHES = 20.0
 """Matches over which errors average out that matches share, such as those of a lens or of the depths of one surface."""
 
 ROTATION_FACTOR = 1.79
-"""Factor on standard deviations of the rotation: that of poses from several references; not measured for one."""
+"""Factor on standard deviations of the rotation; not measured."""
 
 
 @dataclass(frozen=True, eq=False)

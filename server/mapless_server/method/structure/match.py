@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from mapless.geometry import RigidTransform
 from mapless_server.bounds import check_bounds
 
+from ..features.matching import CorrespondOptions
 from ..features.views import PosedView, View
 from ..pairs.correspond import Correspondences
 from .model import PointMatches, Structure
@@ -33,7 +34,7 @@ class MatchOptions:
 
     through_tracks: bool = True
     radius_px: float = 6.0
-    min_similarity: float = 0.89
+    min_similarity: float = CorrespondOptions.guided_similarity
 
     def __post_init__(self) -> None:
         check_bounds(self, "radius_px", at_least=0)

@@ -48,9 +48,13 @@ class KeypointNoise:
 
 
 ONE_PIXEL = KeypointNoise(1.0, 0.0)
+"""The same noise for all keypoints, as in the paper."""
+
 FIRST_GUESS = KeypointNoise(0.3, 0.06)
+"""Noise before it is estimated from the residuals."""
+
 MIN_NOISE_LEVEL_PX = 0.15
-"""Least noise of a keypoint: that of the residuals in surveyed scenes under good light."""
+"""Least noise of a keypoint, pixels: that of the residuals in surveyed scenes under good light."""
 
 
 @dataclass(frozen=True, eq=False)

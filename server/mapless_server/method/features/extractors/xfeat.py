@@ -19,8 +19,8 @@ MULTIPLE_PX = 32
 """Sides of the images that the network takes."""
 
 SHIFT_PX = 0.4
-"""From a maximum of the keypoint map to the image point, right and down: the map has the pixel coordinates used here,
-but the weights were trained with positions rounded down."""
+"""From a maximum of the keypoint map to the image point, right and down, pixels: the positions that the weights were
+trained with are rounded down."""
 
 
 class XfeatExtractor:

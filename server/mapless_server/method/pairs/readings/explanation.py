@@ -21,16 +21,16 @@ from .rounding import rounding_text
 from .sessions import sessions_of
 
 FOCAL_SCALES = np.geomspace(0.2, 5.0, 33)
-"""Wrong image sizes are usually wrong by a factor of up to four."""
-FOCAL_TOLERANCE = 0.03
-"""A focal length that would have to change by less is not the reason."""
+"""Factors on focal lengths that are tried: image sizes are usually wrong by a factor of up to four."""
 GAIN = 0.4
 """Share of the error that an explanation may leave."""
 EQUAL_SHARE, EQUAL_PX = 1.25, 0.1
 """Errors that differ by less than this factor, and this distance, are equal: noise of medians."""
 MOST_NAMED = 2
 """Explanations that are named together, of those that fit equally well."""
+
 _REFINEMENTS = 3
+"""Rounds in which the factor on focal lengths is found, to half a per cent."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def _scalings(sample: PairSample) -> Iterator[_Candidate]:
         return
     for what, change in (("focal lengths are", focal_scaled), ("focal lengths and principal points are", scaled)):
         scale, error_px, bad_share = best_scale(sample, change)
-        if abs(scale - 1) > FOCAL_TOLERANCE and FOCAL_SCALES[0] < scale < FOCAL_SCALES[-1]:
+        if FOCAL_SCALES[0] < scale < FOCAL_SCALES[-1]:
             text = (
                 f"the {what} {scale:.2f} times what is given (intrinsics of another image size, or of a video "
                 "mode that crops?)"
