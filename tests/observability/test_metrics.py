@@ -205,13 +205,6 @@ def test_unknown_or_infinite_quality_is_not_counted(metrics: Metrics) -> None:
     assert samples["mapless_scale_deviation_count", frozenset()] == 0
 
 
-def test_two_servers_in_one_process_count_separately() -> None:
-    first, second = Metrics(), Metrics()
-    first.count("fatal")
-    assert samples_of(first)["mapless_fatal_total", frozenset()] == 1
-    assert samples_of(second)["mapless_fatal_total", frozenset()] == 0
-
-
 def test_caches_are_read_at_every_scrape(metrics: Metrics) -> None:
     count_everything(metrics)
     samples = samples_of(metrics)

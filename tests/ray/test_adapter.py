@@ -11,17 +11,15 @@ from typing import Any
 
 import grpc
 import pytest
-import yaml  # type: ignore[import-untyped]
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 pytest.importorskip("ray.serve", reason="needs Ray Serve: the extra `ray`")
 
 from ray.serve._private.constants import SERVE_LOGGER_NAME
 from ray.serve._private.grpc_util import gRPCGenericServer
-from ray.serve.schema import ServeDeploySchema
 
 from mapless.errors import from_rpc_error
-from mapless_ray import ingress, replica, scaling
+from mapless_ray import ingress, replica
 from mapless_ray.environment import check_environment, variables
 from mapless_ray.ingress import Ingress, add_services
 from mapless_server.observability.metrics import Metrics
@@ -173,21 +171,6 @@ def test_each_replica_of_a_machine_has_its_own_metrics_port(settings: Settings) 
             assert claim is not None
             claim.close()
         assert replica.claim_metrics_port(wanted)[0] == ports[0]
-
-
-# The sample config
-
-
-def test_the_sample_config_is_valid_for_serve() -> None:
-    config = yaml.safe_load((RAY / "serve.yaml").read_text())
-    parsed = ServeDeploySchema.model_validate(config)
-    (application,) = parsed.applications
-    assert application.import_path == "mapless_ray.app:build"
-    assert parsed.grpc_options.grpc_servicer_functions == ["mapless_ray.ingress:add_services"]
-    (deployment,) = application.deployments
-    policy = deployment.autoscaling_config["policy"]["policy_function"]  # type: ignore[index]
-    assert policy == f"{scaling.__name__}:{scaling.by_device_seconds.__name__}"
-    Settings(**application.args)
 
 
 def test_a_shell_takes_the_environment_as_it_is_printed() -> None:

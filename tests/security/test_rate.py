@@ -66,13 +66,6 @@ def test_settling_equals_charging_the_actual_cost(predicted_s: float, actual_s: 
     assert settled.charge("t", "", 20.0, later_s) == pytest.approx(charged.charge("t", "", 20.0, later_s))
 
 
-def test_time_beyond_the_prediction_is_a_debt() -> None:
-    limiter = RateLimiter(1.0, 2.0)
-    assert limiter.charge("t", "", 1.0, 0.0) == 0
-    limiter.settle("t", "", 1.0, 31.0, 100.0)
-    assert limiter.charge("t", "", 1.0, 100.0) == pytest.approx(29.0)
-
-
 def test_a_refund_never_saves_up_more_than_the_burst() -> None:
     limiter = RateLimiter(1.0, 2.0)
     assert limiter.charge("t", "", 2.0, 0.0) == 0

@@ -142,11 +142,6 @@ def refused(call: Callable[[], object]) -> None:
 
 
 class TestConnections:
-    def test_a_client_that_trusts_the_authority_connects(self, files: TlsFiles) -> None:
-        with serving(files) as server:
-            assert server.is_serving(server.options())
-            assert server.who_am_i(server.options()) == ""
-
     def test_client_certificates_are_checked_and_name_the_caller(self, mutual: TlsFiles) -> None:
         with serving(mutual) as server:
             assert server.who_am_i(server.options(signed(AUTHORITY, "robot-7"))) == "robot-7"
@@ -375,23 +370,21 @@ class TestCommand:
             main(["--address", f"localhost:{server.port}", "--timeout", "5", *arguments, "health", "--text"])
         return int(caught.value.code or 0)
 
-    def test_the_command_sends_certificates_and_token(
-        self, server: Serving, flags: dict[str, str], capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        assert self.health(server, flags | {"--client-id": "r7"}) == 0
-        assert capsys.readouterr().out.splitlines()[0].split() == ["server", "SERVING"]
-        assert server.health_metadata["authorization"] == "Bearer mapless_x"
-        assert server.health_metadata["x-client-id"] == "r7"
-
-    def test_a_token_file_has_precedence_over_the_environment(
-        self, server: Serving, flags: dict[str, str], monkeypatch: pytest.MonkeyPatch
+    def test_the_command_sends_certificates_and_the_files_token_first(
+        self,
+        server: Serving,
+        flags: dict[str, str],
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
     ) -> None:
         monkeypatch.setenv("MAPLESS_TOKEN", "mapless_environment")
         file = flags.pop("--token-file")
         assert self.health(server, flags) == 0
         assert server.health_metadata["authorization"] == "Bearer mapless_environment"
-        assert self.health(server, flags | {"--token-file": file}) == 0
+        assert self.health(server, flags | {"--token-file": file, "--client-id": "r7"}) == 0
         assert server.health_metadata["authorization"] == "Bearer mapless_x"
+        assert server.health_metadata["x-client-id"] == "r7"
+        assert capsys.readouterr().out.splitlines()[0].split() == ["server", "SERVING"]
 
     @pytest.mark.parametrize(
         ("changes", "code", "error_text"),

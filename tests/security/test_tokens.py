@@ -368,7 +368,9 @@ class TestCommand:
         code, listed, _ = self.run("list", "--text", path=path)
         assert code == 0
         assert listed == "robot-7  localize  tenant acme  expires 2099-01-01T00:00:00+00:00\n"
-        assert self.run("revoke", "robot-7", path=path) == (0, "", "")
+        assert self.run("create", "b", "--role", "read", path=path)[0] == 0  # names are arguments or options
+        assert self.run("revoke", "--name", "robot-7", path=path) == (0, "", "")
+        assert self.run("revoke", "b", path=path) == (0, "", "")
         assert self.run("list", "--text", path=path) == (0, "", "")
 
     @pytest.mark.parametrize(
@@ -389,12 +391,6 @@ class TestCommand:
         found_code, printed, said = self.run(*arguments, path=path)
         assert (found_code, printed, said.count("\n")) == (code, "", 1)
         assert error_text in said
-
-    def test_names_are_arguments_or_options(self, path: Path) -> None:
-        assert self.run("create", "a", "--role", "read", path=path)[0] == 0
-        assert self.run("create", "--name", "b", "--role", "read", path=path)[0] == 0
-        assert self.run("revoke", "--name", "a", path=path) == (0, "", "")
-        assert [it.name for it in read_tokens(path).tokens] == ["b"]
 
     def test_the_setting_names_the_file(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The client's variable MAPLESS_TOKEN is no setting, and no error."""

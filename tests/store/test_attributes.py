@@ -209,9 +209,3 @@ def test_a_unit_is_the_metre_until_marked(store: Store) -> None:
     assert known_of(store, OFFICE).arbitrary_unit, "it was not damaged, so not to be replaced"
     store.update_scene(OFFICE, arbitrary_unit=False)
     assert known_of(store, OFFICE) == SceneAttributes()
-
-
-def test_attributes_stored_before_there_was_a_unit_are_read() -> None:
-    data = b'{"datum": null, "down_in_world": [0.0, 0.0, -1.0], "calibration": null}'
-    found = codec.decode_attributes("", data, codec.sha256_for("", data))
-    assert found == SceneAttributes(down_in_world=(0.0, 0.0, -1.0))

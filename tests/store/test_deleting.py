@@ -8,18 +8,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sqlalchemy import Connection
 from support.stores import EXTRACTOR, Folder, Place, Shared, assert_same_view, faults_of, make_reference, view_of
 from support.waiting import wait_until
 
 from mapless_server import errors
+from mapless_server.method.features.matching import StoredPair
+from mapless_server.method.features.views import KeptDepth
 from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import Store, deletion, postgresql, reader
 from mapless_server.store.backup import back_up, restore
+from mapless_server.store.calibrations import claim_scene
 from mapless_server.store.deletion import PendingDeletions
+from mapless_server.store.depths import keep_depths
+from mapless_server.store.pairs import PairStore, Progress
 from mapless_server.store.reserve import RESERVE_FILE, Reserve
 from mapless_server.store.sqlite import DATABASE_FILE, SqliteDatabase
+from mapless_server.store.tables import metadata
 
 OFFICE, HALL = SceneKey("office"), SceneKey("hall")
 TABLES = ("reference", "image", "features", "global_descriptor", "removed_reference")
@@ -70,6 +77,30 @@ def test_nothing_is_left(place: Place) -> None:
             store.load_references(HALL, ["stays"], EXTRACTOR).references[0].view, view_of(make_reference("stays", 1))
         )
         assert row_counts(place) == dict.fromkeys((*TABLES, "scene"), 1) | {"removed_reference": 0}
+
+
+def test_all_that_refers_to_a_scene_goes_with_it(place: Place) -> None:
+    tables = {it.name for it in metadata.sorted_tables if it.foreign_keys}
+
+    def filled() -> set[str]:
+        return {it for it in tables if place.fetch(f"SELECT 1 FROM {it} LIMIT 1")}
+
+    with place.open() as store:
+        keys = fill(store, OFFICE)
+        store.add_references(OFFICE, [replace(make_reference("masked"), mask=b"mask")])
+        pairs, progress = PairStore(store.database), Progress()
+        while claim := pairs.claim("nearest", progress):
+            made = {(keys[0], claim.key): StoredPair(np.zeros((1, 2), np.int32))} if claim.key != keys[0] else {}
+            pairs.add("nearest", claim, made, is_complete=True)
+        camera = make_reference("a").camera
+        keep_depths(store.database, "kind", {keys[0]: KeptDepth(camera, np.ones((480, 640), np.float32), 0.02)})
+        assert claim_scene(store.database, "kind") is not None
+        assert filled() == tables
+        store.delete_reference(OFFICE, "r0")
+        assert filled() == tables - {"reference_pair", "reference_depth"}
+        store.delete_scene(OFFICE)
+        assert filled() == set()
+    assert faults_of(place) == ()
 
 
 def test_during_the_deletion_the_scene_is_not_found(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:

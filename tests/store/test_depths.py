@@ -143,14 +143,6 @@ def test_a_server_that_makes_none_uses_any_kind_of_its_version(store: Store, pla
     assert np.array_equal(found.depths[key].depth, second, equal_nan=True)
 
 
-def test_they_are_deleted_with_the_reference_and_the_scene(store: Store, place: Place) -> None:
-    keep_depths(store.database, KIND, {key_of(store, name): kept() for name in "abc"})
-    store.delete_reference(SCENE, "b")
-    assert place.fetch("SELECT count(*) FROM reference_depth") == [(2,)]
-    store.delete_scene(SCENE)
-    assert place.fetch("SELECT count(*) FROM reference_depth") == [(0,)]
-
-
 def test_those_without_use_are_deleted(store: Store, place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also of a reference that no server has claimed."""
     keep_depths(store.database, OTHER, {key_of(store, name): kept() for name in "ab"})

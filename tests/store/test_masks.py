@@ -1,16 +1,14 @@
-"""Masks in the store: kept byte for byte, through backup and deletion, and their damage is named."""
+"""Masks in the store: kept byte for byte, and their damage is named."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from sqlalchemy import func, select
 from support.stores import Folder, Place, faults_of, make_reference
 
 from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey
-from mapless_server.store import Store, tables
-from mapless_server.store.backup import back_up, restore
+from mapless_server.store import Store
 
 SCENE = SceneKey("office")
 MASK = bytes(range(256)) * 40
@@ -23,11 +21,6 @@ def filled(store: Store) -> dict[str, str]:
     return {it.reference_id: it.key for it in store.add_references(SCENE, [masked, plain])}
 
 
-def count(store: Store) -> int:
-    with store.database.read() as connection:
-        return connection.scalar(select(func.count()).select_from(tables.mask)) or 0
-
-
 def test_a_mask_comes_back_and_goes_with_its_reference(place: Place) -> None:
     with place.open() as store:
         keys = filled(store)
@@ -35,16 +28,7 @@ def test_a_mask_comes_back_and_goes_with_its_reference(place: Place) -> None:
         assert store.read_mask_of(keys["plain"]) == b""
         assert [len(it.mask_sha256) for it in store.list_references(SCENE, 10)] == [64, 0]
         store.delete_reference(SCENE, "masked")
-        assert count(store) == 0
-
-
-def test_a_mask_is_in_the_backup(place: Place, tmp_path: Path) -> None:
-    with place.open() as store:
-        key = filled(store)["masked"]
-        assert back_up(store.database, tmp_path / "backup").counts["mask"] == 1
-    with Store.open(tmp_path / "other") as other:
-        assert restore(tmp_path / "backup", other.database).faults == ()
-        assert other.read_mask_of(key) == MASK
+        assert place.fetch("SELECT count(*) FROM mask") == [(0,)]
 
 
 @pytest.mark.parametrize("statement", ["UPDATE mask SET data = 'x'", "DELETE FROM mask"])

@@ -47,13 +47,14 @@ def claim_all(stored: PairStore, progress: Progress | None = None) -> list[Claim
     return found
 
 
-def complete(store: Store, stored: PairStore) -> dict[tuple[str, str], np.ndarray]:
-    """Every pair of the scene; what was stored."""
+def complete(store: Store, stored: PairStore, matching: str = MATCHING) -> dict[tuple[str, str], np.ndarray]:
+    """Makes every pair of the scene that is missing; what was stored."""
     everything: dict[tuple[str, str], np.ndarray] = {}
-    for claim in claim_all(stored):
-        others = stored.list_missing(MATCHING, claim, [key_of(store, name) for name in "abc"], 20)
+    progress = Progress()
+    while claim := stored.claim(matching, progress):
+        others = stored.list_missing(matching, claim, [key_of(store, name) for name in "abc"], 20)
         made = {(other, claim.key): matches(5, seed) for seed, other in enumerate(others)}
-        stored.add(MATCHING, claim, {pair: StoredPair(it, 1.5) for pair, it in made.items()}, is_complete=True)
+        stored.add(matching, claim, {pair: StoredPair(it, 1.5) for pair, it in made.items()}, is_complete=True)
         everything |= made
     return everything
 
@@ -85,14 +86,6 @@ class TestMatches:
         store.add_references(SCENE, [make_reference("b", 7)])
         assert key_of(store, "b") != gone
         assert stored.load(MATCHING, [(key_of(store, "a"), key_of(store, "b"))]) == {}
-
-    def test_are_deleted_with_the_scene(self, two: tuple[Store, PairStore], place: Place) -> None:
-        store, stored = two
-        complete(store, stored)
-        store.delete_scene(SCENE)
-        for table in ("reference_pair", "reference_matching"):
-            assert place.fetch(f"SELECT count(*) FROM {table}") == [(0,)]
-        assert faults_of(place) == ()
 
     @pytest.mark.parametrize(
         "damage",
@@ -218,22 +211,11 @@ OURS, THEIRS = "aliked/strict", "sift/strict"
 def used(two: tuple[Store, PairStore], monkeypatch: pytest.MonkeyPatch) -> Store:
     """Every pair of the three references, matched in two ways, both used now."""
     monkeypatch.setattr(pairs, "_REFERENCES_AT_A_TIME", 2)
-    store, _ = two
+    store, stored = two
     for name in (OURS, THEIRS):
-        match_all(store, name)
+        complete(store, stored, name)
     record_use(store.database, [OURS, THEIRS])
     return store
-
-
-def match_all(store: Store, name: str) -> int:
-    """Number of pairs that are stored."""
-    pairs, progress, count = PairStore(store.database), Progress(), 0
-    keys = list(store.find_keys(SCENE, ["a", "b", "c"]).values())
-    while claim := pairs.claim(name, progress):
-        made = {(other, claim.key): pair_of(1) for other in pairs.list_missing(name, claim, keys, 9)}
-        pairs.add(name, claim, made, is_complete=True)
-        count += len(made)
-    return count
 
 
 def count_pairs(place: Place) -> Counter[str]:
@@ -266,8 +248,8 @@ def unused(used: Store, monkeypatch: pytest.MonkeyPatch) -> Store:
 def test_deleted_pairs_are_made_again(unused: Store, place: Place) -> None:
     delete_unused(unused.database, nothing)
     record_use(unused.database, [THEIRS])
-    assert match_all(unused, OURS) == 0
-    assert match_all(unused, THEIRS) == 3
+    assert complete(unused, PairStore(unused.database), OURS) == {}
+    assert len(complete(unused, PairStore(unused.database), THEIRS)) == 3
     assert count_pairs(place) == {OURS: 3, THEIRS: 3}
 
 
@@ -282,7 +264,7 @@ def test_a_server_that_comes_back_meanwhile_stops_it(unused: Store, place: Place
     delete_unused(unused.database, second_portion)
     assert len(calls) == 2
     assert place.fetch("SELECT count(*) FROM reference_matching WHERE matching = ?", THEIRS) == [(1,)]
-    assert match_all(unused, THEIRS) > 0
+    assert complete(unused, PairStore(unused.database), THEIRS)
 
 
 def test_a_deletion_that_was_interrupted_is_completed(unused: Store, place: Place) -> None:

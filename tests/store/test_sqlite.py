@@ -30,11 +30,6 @@ def store(data_dir: Path) -> Iterator[Store]:
 
 
 class TestFaults:
-    def test_a_file_in_place_of_the_folder_is_named(self, tmp_path: Path) -> None:
-        (tmp_path / "ok.jpg").touch()
-        with pytest.raises(StoreError, match=r"ok\.jpg is a file, not a folder"):
-            Store.open(tmp_path / "ok.jpg")
-
     def test_a_full_disk_is_reported_and_harms_nothing(self, store: Store) -> None:
         store.create_scene(OFFICE)
         store.add_references(OFFICE, [make_reference("a")])
@@ -166,6 +161,7 @@ class TestOpening:
                 Store.open(data_dir)
             assert str(data_dir) in str(caught.value)
             assert "\n" not in str(caught.value)
+            assert data_dir != file or "is a file, not a folder" in str(caught.value)
 
     @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
     def test_unwritable_folder_is_refused(self, tmp_path: Path) -> None:

@@ -116,16 +116,6 @@ class TestGenerations:
                 store.delete_scene(OFFICE)
         assert seen == sorted(set(seen))
 
-    def test_a_new_life_repeats_no_key(self, store: Store) -> None:
-        store.create_scene(OFFICE)
-        keys = set()
-        for seed in range(3):
-            keys.add(store.add_references(OFFICE, [make_reference("a", seed)])[0].key)
-            snapshot = store.load_references(OFFICE, ["a"], EXTRACTOR)
-            assert_same_view(snapshot.references[0].view, view_of(make_reference("a", seed)))
-            store.delete_reference(OFFICE, "a")
-        assert len(keys) == 3
-
 
 class TestReferences:
     @pytest.mark.parametrize(
