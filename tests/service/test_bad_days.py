@@ -1,4 +1,4 @@
-"""A disk that is full, read-only, slow or damaged; two servers on one file; a scene that is deleted while it is asked.
+"""A disk that is full, read-only, slow, or fails.
 
 What can be answered is answered, what cannot says why, and everything works again without a restart when the fault is
 gone.
@@ -7,13 +7,11 @@ gone.
 import json
 import shutil
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import grpc
 import numpy as np
@@ -23,7 +21,7 @@ from sqlalchemy import Connection
 from support.commands import run_client
 from support.disks import fail, failing_disk, mount, small_disk
 from support.images import encode
-from support.servers import CAMERA, PHOTO, StandInMethod, pose, serving
+from support.servers import CAMERA, PHOTO, pose, serving
 from support.waiting import wait_until
 
 from mapless import (
@@ -33,13 +31,8 @@ from mapless import (
     LocalizationResult,
     MaplessError,
     NewReference,
-    NotFound,
-    Rejected,
-    Unavailable,
 )
 from mapless.geometry import Camera
-from mapless_server.method.features.views import PosedView, View
-from mapless_server.method.judge.answer import Answer
 from mapless_server.serve import running
 from mapless_server.serve.running import watch_store
 from mapless_server.services.handlers import SERVICE_NAMES
@@ -124,192 +117,138 @@ def faults_of(folder: Path) -> tuple[str, ...]:
         return verify(connection).faults
 
 
-class TestDisk:
-    def test_a_full_disk_costs_changes_only_until_there_is_room(self, tmp_path: Path) -> None:
-        with small_disk(tmp_path / "disk", 4) as disk:
-            with served(disk / "data") as client:
-                fill(client, 1)
-                stored = {"r0"}
-                for i in range(1, 60):
-                    error = error_of(partial(client.add_reference, "s", large(i)))
-                    if error is not None:
-                        break
-                    stored.add(f"r{i}")
-                assert error is not None
-                assert (error.code, error.reason, error.retry_after_s) == ("RESOURCE_EXHAUSTED", "STORE_FULL", None)
-                assert len(stored) > 3
-                assert is_answered(client, "r0")
-                assert is_answered(client)
-                assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
-                assert health_of(client)[:2] == (True, True)
-                assert mount("-o", "remount,size=40m", str(disk)) == 0
-                client.add_reference("s", NewReference("late", large_photo(99), LARGE, pose(9)))
-                wait_until(lambda: health_of(client) == (True, True, True))
-                assert {it.reference_id for it in client.list_references("s")} == stored | {"late"}
-            assert faults_of(disk / "data") == ()
-
-    def test_what_fills_the_disk_can_be_deleted(self, tmp_path: Path) -> None:
-        with small_disk(tmp_path / "disk", 72) as disk, served(disk / "data") as client:
-            (disk / "filler").write_bytes(bytes(56 * 2**20))
+def test_a_full_disk_costs_changes_only_until_there_is_room(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 4) as disk:
+        with served(disk / "data") as client:
             fill(client, 1)
+            stored = {"r0"}
             for i in range(1, 60):
-                if error_of(partial(client.add_reference, "s", large(i))) is not None:
+                error = error_of(partial(client.add_reference, "s", large(i)))
+                if error is not None:
                     break
-            fill_up(disk)
-            for it in [it.reference_id for it in client.list_references("s")][1:]:
-                client.delete_reference("s", it)
-            client.delete_scene("s")
-            client.create_scene("t")
-            client.add_reference("t", large(0))
-            assert client.get_reference("t", "r0", include_image=True).image == large_photo(0)
-
-    def test_a_disk_full_from_the_start_serves_queries(self, tmp_path: Path) -> None:
-        with small_disk(tmp_path / "disk", 8) as disk:
-            with served(disk / "stopped") as client:
-                fill(client, 2)
-                # What lies there while it runs is what a kill leaves behind.
-                shutil.copytree(disk / "stopped", disk / "killed")
-            fill_up(disk)
-            with served(disk / "stopped") as client:
-                assert is_answered(client)
-            (disk / "stopped" / RESERVE_FILE).unlink()
-            fill_up(disk)
-            with pytest.raises(StoreError, match=r"the disk is full$"), served(disk / "stopped"):
-                pass
-            with served(disk / "killed") as client:
-                wait_until(lambda: health_of(client) == (True, True, False))
-                assert is_answered(client)
-                error = error_of(lambda: client.create_scene("t"))
-                assert (error and error.code, error and error.reason) == ("RESOURCE_EXHAUSTED", "STORE_FULL")
-                (disk / "filler").unlink()
-                wait_until(lambda: health_of(client) == (True, True, True))
-                client.create_scene("t")
-
-    def test_a_disk_read_only_from_the_start_serves_queries(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        with small_disk(tmp_path / "disk", 16) as disk:
-            with served(disk / "data") as client:
-                fill(client)
-            assert mount("-o", "remount,ro", str(disk)) == 0
-            with served(disk / "data") as client, served(disk / "data") as other:
-                for each in (client, other):
-                    self.serves_queries_alone(each)
-                code, printed, _ = run_client(capsys, "--address", client.address, "health")
-            assert (code, json.loads(printed)["ReferenceService"]) == (0, "NOT_SERVING")
-            assert mount("-o", "remount,rw", str(disk)) == 0
-            with served(disk / "data") as client:
-                client.create_scene("t")
-                assert health_of(client) == (True, True, True)
-
-    def serves_queries_alone(self, client: HealthClient) -> None:
-        assert is_answered(client)
-        assert is_answered(client, "r1", "r2")
-        assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
-        wait_until(lambda: health_of(client) == (True, True, False))
-        for change in (
-            lambda: client.create_scene("t"),
-            lambda: client.delete_reference("s", "r0"),
-            lambda: client.add_reference("s", large(9)),
-        ):
-            error = error_of(change)
+                stored.add(f"r{i}")
             assert error is not None
-            assert (error.code, error.reason) == ("FAILED_PRECONDITION", "STORE_READ_ONLY")
-
-    @pytest.mark.nightly
-    def test_a_disk_that_fails_meanwhile_leaves_what_can_be_served(self, tmp_path: Path) -> None:
-        with failing_disk(tmp_path / "disk", 32) as disk, served(disk / "data") as client:
-            fill(client)
-            fail(disk)
-            error = error_of(lambda: client.create_scene("t"))
-            assert error is not None
-            assert (error.code, error.reason) == ("UNAVAILABLE", "STORE_UNAVAILABLE")
-            assert error.retry_after_s is not None
-            wait_until(lambda: health_of(client) == (True, True, False))
-            assert is_answered(client, "r1", "r2")
+            assert (error.code, error.reason, error.retry_after_s) == ("RESOURCE_EXHAUSTED", "STORE_FULL", None)
+            assert len(stored) > 3
+            assert is_answered(client, "r0")
             assert is_answered(client)
             assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
+            assert health_of(client)[:2] == (True, True)
+            assert mount("-o", "remount,size=40m", str(disk)) == 0
+            client.add_reference("s", NewReference("late", large_photo(99), LARGE, pose(9)))
+            wait_until(lambda: health_of(client) == (True, True, True))
+            assert {it.reference_id for it in client.list_references("s")} == stored | {"late"}
+        assert faults_of(disk / "data") == ()
 
-    def test_a_slow_disk_delays_no_answer_from_memory(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        slow, meets, goes_on = (threading.Event() for _ in range(3))
-        real_read = SqliteDatabase.read
 
-        @contextmanager
-        def read(database: SqliteDatabase) -> Iterator[Connection]:
-            if slow.is_set():
-                meets.set()
-                assert goes_on.wait(30)
-            with real_read(database) as connection:
-                yield connection
+def test_what_fills_the_disk_can_be_deleted(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 72) as disk, served(disk / "data") as client:
+        (disk / "filler").write_bytes(bytes(56 * 2**20))
+        fill(client, 1)
+        for i in range(1, 60):
+            if error_of(partial(client.add_reference, "s", large(i))) is not None:
+                break
+        fill_up(disk)
+        for it in [it.reference_id for it in client.list_references("s")][1:]:
+            client.delete_reference("s", it)
+        client.delete_scene("s")
+        client.create_scene("t")
+        client.add_reference("t", large(0))
+        assert client.get_reference("t", "r0", include_image=True).image == large_photo(0)
 
-        monkeypatch.setattr(SqliteDatabase, "read", read)
-        with served(tmp_path) as client, ThreadPoolExecutor(4) as pool:
+
+def test_a_disk_full_from_the_start_serves_queries(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk", 8) as disk:
+        with served(disk / "stopped") as client:
+            fill(client, 2)
+            # What lies there while it runs is what a kill leaves behind.
+            shutil.copytree(disk / "stopped", disk / "killed")
+        fill_up(disk)
+        with served(disk / "stopped") as client:
+            assert is_answered(client)
+        (disk / "stopped" / RESERVE_FILE).unlink()
+        fill_up(disk)
+        with pytest.raises(StoreError, match=r"the disk is full$"), served(disk / "stopped"):
+            pass
+        with served(disk / "killed") as client:
+            wait_until(lambda: health_of(client) == (True, True, False))
+            assert is_answered(client)
+            error = error_of(lambda: client.create_scene("t"))
+            assert (error and error.code, error and error.reason) == ("RESOURCE_EXHAUSTED", "STORE_FULL")
+            (disk / "filler").unlink()
+            wait_until(lambda: health_of(client) == (True, True, True))
+            client.create_scene("t")
+
+
+def test_a_disk_read_only_from_the_start_serves_queries(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with small_disk(tmp_path / "disk", 16) as disk:
+        with served(disk / "data") as client:
             fill(client)
-            assert is_answered(client, "r0", "r1")
-            slow.set()
-            listed = [pool.submit(lambda: list(client.list_references("s"))) for _ in range(2)]
-            late = pool.submit(error_of, lambda: client.get_scene("s", timeout_s=0.5))
-            assert meets.wait(30)
-            assert client.is_serving()
-            assert is_answered(client, "r0", "r1")
-            assert not any(it.done() for it in listed), "what is in memory waited for the disk"
-            assert isinstance(late.result(30), DeadlineExceeded)
-            goes_on.set()
-            assert [len(it.result(60)) for it in listed] == [3, 3]
+        assert mount("-o", "remount,ro", str(disk)) == 0
+        with served(disk / "data") as client, served(disk / "data") as other:
+            for each in (client, other):
+                serves_queries_alone(each)
+            code, printed, _ = run_client(capsys, "--address", client.address, "health")
+        assert (code, json.loads(printed)["ReferenceService"]) == (0, "NOT_SERVING")
+        assert mount("-o", "remount,rw", str(disk)) == 0
+        with served(disk / "data") as client:
+            client.create_scene("t")
+            assert health_of(client) == (True, True, True)
 
 
-class TestScenesThatGo:
-    @pytest.mark.nightly
-    def test_a_scene_made_anew_during_calls_gives_no_mixed_answer(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """The n-th scene of this name has all its references, whose names are always the same, at x = n."""
-        life, lives, stop = [0], 12, threading.Event()
-        together: set[frozenset[float]] = set()
-        real_call = StandInMethod.__call__
+def serves_queries_alone(client: HealthClient) -> None:
+    assert is_answered(client)
+    assert is_answered(client, "r1", "r2")
+    assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
+    wait_until(lambda: health_of(client) == (True, True, False))
+    for change in (
+        lambda: client.create_scene("t"),
+        lambda: client.delete_reference("s", "r0"),
+        lambda: client.add_reference("s", large(9)),
+    ):
+        error = error_of(change)
+        assert error is not None
+        assert (error.code, error.reason) == ("FAILED_PRECONDITION", "STORE_READ_ONLY")
 
-        def call(method: StandInMethod, query: View, references: Sequence[PosedView], *more: Any) -> Answer:
-            together.add(frozenset(float(it.world_from_camera.translation[0]) for it in references))
-            return real_call(method, query, references, *more)
 
-        monkeypatch.setattr(StandInMethod, "__call__", call)
+@pytest.mark.nightly
+def test_a_disk_that_fails_meanwhile_leaves_what_can_be_served(tmp_path: Path) -> None:
+    with failing_disk(tmp_path / "disk", 32) as disk, served(disk / "data") as client:
+        fill(client)
+        fail(disk)
+        error = error_of(lambda: client.create_scene("t"))
+        assert error is not None
+        assert (error.code, error.reason) == ("UNAVAILABLE", "STORE_UNAVAILABLE")
+        assert error.retry_after_s is not None
+        wait_until(lambda: health_of(client) == (True, True, False))
+        assert is_answered(client, "r1", "r2")
+        assert is_answered(client)
+        assert client.get_reference("s", "r0", include_image=True).image == large_photo(0)
 
-        def make(client: Client) -> None:
-            client.create_scene("s")
-            added = [NewReference(f"r{i}", PHOTO, CAMERA, pose(float(life[0]))) for i in range(3)]
-            client.add_references("s", added)
 
-        def ask(address: str, asked: tuple[str, ...]) -> Iterator[str]:
-            with Client(address, ONCE) as client:
-                while not stop.is_set():
-                    began = life[0]
-                    try:
-                        answer = client.localize(PHOTO, CAMERA, "s", asked)
-                    except (NotFound, Unavailable) as error:
-                        yield error.code
-                        continue
-                    if isinstance(answer, Rejected):  # between its creation and its references
-                        yield str(answer.reason)
-                        continue
-                    assert began <= answer.world_from_camera.translation[0] <= life[0]
-                    yield "OK"
+def test_a_slow_disk_delays_no_answer_from_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slow, meets, goes_on = (threading.Event() for _ in range(3))
+    real_read = SqliteDatabase.read
 
-        with serving(tmp_path, workers=2) as server, Client(server.address, ONCE) as client, ExitStack() as stack:
-            make(client)
-            pool = stack.enter_context(ThreadPoolExecutor(6))
-            stack.callback(stop.set)
-            kinds = [("r2", "r0"), ()] * 3
-            asking = [pool.submit(list, ask(server.address, kind)) for kind in kinds]
-            for number in range(1, lives):
-                time.sleep(0.05)
-                client.delete_scene("s")
-                life[0] = number
-                make(client)
-            answers = server.method.call_count
-            wait_until(lambda: server.method.call_count > answers + len(kinds))
-            stop.set()
-            seen = {code for it in asking for code in it.result(60)}
-        assert "OK" in seen
-        assert seen <= {"OK", "NOT_FOUND", "UNAVAILABLE", "NO_USABLE_REFERENCES"}
-        assert all(len(it) == 1 for it in together), "references of several lives in one answer"
-        assert len(together) > 1
+    @contextmanager
+    def read(database: SqliteDatabase) -> Iterator[Connection]:
+        if slow.is_set():
+            meets.set()
+            assert goes_on.wait(30)
+        with real_read(database) as connection:
+            yield connection
+
+    monkeypatch.setattr(SqliteDatabase, "read", read)
+    with served(tmp_path) as client, ThreadPoolExecutor(4) as pool:
+        fill(client)
+        assert is_answered(client, "r0", "r1")
+        slow.set()
+        listed = [pool.submit(lambda: list(client.list_references("s"))) for _ in range(2)]
+        late = pool.submit(error_of, lambda: client.get_scene("s", timeout_s=0.5))
+        assert meets.wait(30)
+        assert client.is_serving()
+        assert is_answered(client, "r0", "r1")
+        assert not any(it.done() for it in listed), "what is in memory waited for the disk"
+        assert isinstance(late.result(30), DeadlineExceeded)
+        goes_on.set()
+        assert [len(it.result(60)) for it in listed] == [3, 3]

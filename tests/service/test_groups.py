@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime, timezone
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +11,7 @@ from support.compare import assert_pose_close
 from support.corner import photograph
 from support.corner import pose as corner_pose
 from support.images import encode
-from support.messages import set_field
-from support.servers import CAMERA, PHOTO, Stubs, failure_of, pose, serving_really
+from support.servers import pose, serving_really
 
 from mapless import (
     Camera,
@@ -30,12 +28,9 @@ from mapless import (
     RigLocalization,
     SequenceFrame,
     SequenceLocalization,
-    wire,
 )
 from mapless.axes import Axes, pose_to
 from mapless.geometry import rotation_from_vector
-from mapless.v1 import geometry_pb2 as geometry_pb
-from mapless.v1 import localization_service_pb2 as pb
 
 CORNER = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
 STANDPOINTS = [corner_pose(-15.0 + 6 * i, height_m=-1.6 + 0.05 * (i % 2)) for i in range(6)]
@@ -202,81 +197,3 @@ def test_references_may_be_named_for_each_image(corner: Client, queries: list[by
     with pytest.raises(NotFound) as caught:
         corner.localize_rig([image, RigImage(queries[0], CORNER, RIG_FROM_CAMERA[0], ("p0", "absent"))], "corner")
     assert caught.value.field == "images[1].references[1]"
-
-
-# What is refused, before anything is computed
-
-
-def rig_request(scene: str) -> pb.LocalizeRigRequest:
-    image = pb.RigImage(
-        image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), rig_from_camera=wire.transform_to_message(pose(0.1))
-    )
-    return pb.LocalizeRigRequest(scene=f"scenes/{scene}", images=[image] * 3)
-
-
-def sequence_request(scene: str) -> pb.LocalizeSequenceRequest:
-    frame = pb.SequenceFrame(
-        image=PHOTO, intrinsics=wire.camera_to_message(CAMERA), session_from_camera=wire.transform_to_message(pose(0.1))
-    )
-    return pb.LocalizeSequenceRequest(scene=f"scenes/{scene}", frames=[frame] * 3)
-
-
-Case = tuple[str, Any] | tuple[str, Any, str]
-
-
-def shifted(y_m: float) -> geometry_pb.RigidTransform:
-    return wire.transform_to_message(RigidTransform(np.eye(3), np.array([0, y_m, 0])))
-
-
-BAD_RIGS: dict[str, Case] = {
-    "no image": ("images", None),
-    "9 images": ("images", list(rig_request("").images) * 2),
-    "no pose": ("images[1].rig_from_camera", None),
-    "time in nanoseconds": ("capture_time.seconds", 1_700_000_000_000_000_000, "capture_time"),
-    "pose at NaN": ("images[2].rig_from_camera.translation_m.y", math.nan),
-    "pose far away": ("images[2].rig_from_camera.translation_m.y", 1e8),
-    "zero rotation": ("images[0].rig_from_camera.rotation", geometry_pb.Quaternion()),
-    "no intrinsics": ("images[2].intrinsics", None),
-    "not an image": ("images[1].image", b"<svg/>"),
-    "reference of another scene": ("images[1].references", ["scenes/other/references/r1"], "images[1].references[0]"),
-    "heading without a direction": ("images[1].heading_prior", pb.HeadingPrior(), "images[1].heading_prior.direction"),
-    "satellite without a datum": ("images[2].geo_position_prior", pb.GeoPositionPrior(horizontal_sigma_m=1.0)),
-    "another variant": ("options.variant", pb.VARIANT_FULL),
-    "65 chosen": ("options.reference_count", 65),
-    "no scene": ("scene", None),
-    "session at NaN": ("session_from_rig", shifted(math.nan), "session_from_rig.translation_m.y"),
-    "other axes": ("options.axes", pb.AXES_UNITY),
-    "unknown axes": ("options.axes", 77),
-}
-BAD_SEQUENCES: dict[str, Case] = {
-    "17 frames": ("frames", [sequence_request("").frames[0]] * 14),
-    "no pose": ("frames[1].session_from_camera", None),
-    "NaN rotation": ("frames[1].session_from_camera.rotation.w", math.nan, "frames[1].session_from_camera.rotation"),
-    "unknown axes": ("options.axes", 77),
-    "other size": ("frames[2].intrinsics.width_px", 97),
-    "time in milliseconds": ("frames[1].capture_time.seconds", 1_700_000_000_000, "frames[1].capture_time"),
-}
-
-
-@pytest.mark.parametrize("name", BAD_RIGS)
-def test_bad_rigs_are_refused_by_field(stubs: Stubs, scene: str, name: str) -> None:
-    check_refused(stubs.localization.LocalizeRig, rig_request(scene), BAD_RIGS[name])
-
-
-@pytest.mark.parametrize("name", BAD_SEQUENCES)
-def test_bad_sequences_are_refused_by_field(stubs: Stubs, scene: str, name: str) -> None:
-    check_refused(stubs.localization.LocalizeSequence, sequence_request(scene), BAD_SEQUENCES[name])
-
-
-def test_a_single_frame_is_no_sequence(stubs: Stubs, scene: str) -> None:
-    request = sequence_request(scene)
-    del request.frames[1:]
-    error = failure_of(stubs.localization.LocalizeSequence, request)
-    assert (error.code, error.field) == ("INVALID_ARGUMENT", "frames")
-
-
-def check_refused(method: Any, request: Any, case: Case) -> None:
-    path, value, *other = case
-    set_field(request, path, value)
-    error = failure_of(method, request)
-    assert (error.code, error.field) == ("INVALID_ARGUMENT", (*other, path)[0]), error

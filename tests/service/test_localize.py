@@ -1,20 +1,20 @@
 """Localize through a real server: requests, answers, refusals."""
 
 import itertools
-import math
 import threading
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from support.images import encode, png_claiming, textured, with_exif_orientation
-from support.messages import set_field
-from support.servers import CAMERA, COVARIANCE, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose
+from support.servers import CAMERA, COARSE_X_M, COVARIANCE, PHOTO, RunningServer, Staged, make_scene, pose, serving
+from support.waiting import wait_until, with_enough_time
 
 from mapless import (
     Client,
     ConnectOptions,
+    DeadlineExceeded,
     InvalidArgument,
     LocalizationResult,
     NewReference,
@@ -25,14 +25,9 @@ from mapless import (
     Unavailable,
 )
 from mapless.geodesy import Datum, geodetic_from_world
-from mapless.geometry import Camera
 from mapless.priors import GeoPositionPrior, GravityPrior
-from mapless.v1 import geometry_pb2 as geometry_pb
-from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
-
-JPEG = encode(".jpg", textured())
 
 
 def localized(answer: LocalizationResult | Rejected) -> LocalizationResult:
@@ -130,72 +125,14 @@ def test_a_pose_outside_the_prior_is_rejected(client: Client, scene: str) -> Non
     assert "0.10 m outside" in answer.message
 
 
-def test_exif_orientation_does_not_turn_the_intrinsics(client: Client, scene: str) -> None:
-    turned = Camera(64, 96, 80.0, 81.0, 31.5, 47.5)
-    with pytest.raises(InvalidArgument, match="64x96 pixels, the image has 96x64") as caught:
-        client.localize(with_exif_orientation(JPEG, 6), turned, scene)
-    assert caught.value.field == "intrinsics.width_px"
-
-
-Case = tuple[str, Any] | tuple[str, Any, str]
-"""The field that is set, to what, and the field that is refused if it is another one."""
-
-
-def session_at(**quaternion: float) -> geometry_pb.RigidTransform:
-    return geometry_pb.RigidTransform(
-        rotation=geometry_pb.Quaternion(**quaternion), translation_m=geometry_pb.Vector3(x=0, y=0, z=0)
-    )
-
-
-def prior_at(radius_m: float, x_m: float = 0.0) -> pb.PositionPrior:
-    return pb.PositionPrior(position_m=geometry_pb.Vector3(x=x_m), radius_m=radius_m)
-
-
-BAD_REQUESTS: dict[str, Case] = {
-    "no image": ("image", b""),
-    "not an image": ("image", b"<svg/>" * 30),
-    "truncated": ("image", PHOTO[:-100]),
-    "900 megapixels": ("image", png_claiming(30_000, 30_000)),
-    "too many bytes": ("image", PHOTO + bytes(17 * 2**20)),
-    "no intrinsics": ("intrinsics", None),
-    "other size": ("intrinsics.width_px", 97),
-    "focal length 0": ("intrinsics.focal_x_px", 0.0),
-    "focal length NaN": ("intrinsics.focal_x_px", math.nan),
-    "principal point infinite": ("intrinsics.principal_y_px", math.inf),
-    "zero quaternion": ("session_from_camera", session_at(), "session_from_camera.rotation"),
-    "radius 0": ("position_prior", prior_at(0.0), "position_prior.radius_m"),
-    "time in milliseconds": ("capture_time.seconds", 1_700_000_000_000, "capture_time"),
-    "time of -5 ns": ("capture_time.nanos", -5, "capture_time"),
-    "no scene": ("scene", None),
-    "scene id alone": ("scene", "kitchen"),
-    "duplicate reference": ("references", ["{scene}/references/r1"] * 2, "references[1]"),
-    "reference of another scene": ("references", ["scenes/other/references/r1"], "references[0]"),
-    "reference id with ..": ("references", ["{scene}/references/a..b"], "references[0]"),
-    "reference id with /": ("references", ["{scene}/references/../../etc/passwd"], "references[0]"),
-    "reference id of 10,000": ("references", ["{scene}/references/" + "x" * 10_000], "references[0]"),
-    "65 references": ("references", [f"{{scene}}/references/r{i}" for i in range(65)]),
-    "unknown variant": ("options.variant", 77),
-    "unknown scale strategy": ("options.scale_strategy", -1),
-    "65 chosen": ("options.reference_count", 65),
-    "-1 chosen": ("options.reference_count", -1),
-}
-
-
-@pytest.mark.parametrize("name", BAD_REQUESTS)
-def test_bad_requests_are_refused_by_field(
-    server: RunningServer, stubs: Stubs, client: Client, scene: str, name: str
-) -> None:
-    path, value, *other = BAD_REQUESTS[name]
-    if path == "references":
-        value = [it.format(scene=f"scenes/{scene}") for it in value]
-    request = localize_request(scene)
-    set_field(request, path, value)
+@pytest.mark.parametrize("image", [b"", PHOTO[:-100]], ids=["by its header", "by its pixels"])
+def test_a_bad_request_is_refused_by_its_field(server: RunningServer, client: Client, scene: str, image: bytes) -> None:
+    """Nothing is computed; all other fields are in `services/test_refused_requests.py`."""
     computed_before = server.method.call_count
-    error = failure_of(stubs.localization.Localize, request)
-    assert (error.code, error.field) == ("INVALID_ARGUMENT", (*other, path)[0])
-    assert len(error.message) <= 1000
+    with pytest.raises(InvalidArgument) as caught:
+        client.localize(image, CAMERA, scene)
+    assert caught.value.field == "image"
     assert server.method.call_count == computed_before
-    localized(client.localize(PHOTO, CAMERA, scene))
 
 
 def test_unknown_scenes_and_references(client: Client, scene: str) -> None:
@@ -242,3 +179,19 @@ def test_satellites_and_a_covariance_narrow_the_choice_alike(client: Client) -> 
     assert isinstance(nowhere, Rejected)
     assert (nowhere.reason, nowhere.message) == ("NO_USABLE_REFERENCES", "no reference is where the prior says")
     client.delete_scene("square")
+
+
+def test_the_coarse_pose_is_answered_if_refining_has_no_time(tmp_path: Path) -> None:
+    staged = Staged()
+    with serving(tmp_path, method=staged.method()) as server, Client(server.address) as client:
+        make_scene(client)
+        coarse = with_enough_time(
+            lambda limit_s: client.localize(PHOTO, CAMERA, "s", allow_coarse=True, timeout_s=limit_s), DeadlineExceeded
+        )
+        assert isinstance(coarse, LocalizationResult)
+        assert (coarse.pose_stage, coarse.covariance, coarse.accuracy) == ("COARSE", None, None)
+        np.testing.assert_allclose(coarse.world_from_camera.matrix(), pose(COARSE_X_M).matrix(), atol=1e-9)
+        with pytest.raises(DeadlineExceeded):
+            client.localize(PHOTO, CAMERA, "s", timeout_s=1.0)
+        assert staged.refining.acquire(blocking=False)
+        wait_until(lambda: server.value("mapless_jobs_terminated_total", outcome="degraded"))

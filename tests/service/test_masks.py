@@ -10,8 +10,6 @@ from support.images import encode
 from support.servers import CAMERA, PHOTO, Stubs, failure_of, localize_request, pose
 
 from mapless import Client, InvalidArgument, NewReference
-from mapless.v1 import localization_service_pb2 as pb
-from mapless.v1 import reference_service_pb2 as reference_pb
 
 VALUES = np.full((CAMERA.height_px, CAMERA.width_px), 255, np.uint8)
 VALUES[:20] = 0
@@ -70,12 +68,3 @@ def test_a_wrong_mask_is_refused_by_its_field(stubs: Stubs, scene: str, mask: by
     request.mask = mask
     error = failure_of(stubs.localization.Localize, request)
     assert (error.code, error.reason, error.field) == ("INVALID_ARGUMENT", reason, "mask")
-    part = pb.RigImage(image=request.image, intrinsics=request.intrinsics, mask=mask)
-    part.rig_from_camera.rotation.w = 1
-    part.rig_from_camera.translation_m.SetInParent()
-    rig = pb.LocalizeRigRequest(scene=request.scene, images=[part])
-    assert failure_of(stubs.localization.LocalizeRig, rig).field == "images[0].mask"
-    retrieve = reference_pb.RetrieveReferencesRequest(
-        scene=request.scene, image=request.image, intrinsics=request.intrinsics, mask=mask
-    )
-    assert failure_of(stubs.references.RetrieveReferences, retrieve).reason == reason

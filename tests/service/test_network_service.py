@@ -21,7 +21,7 @@ from support.servers import RunningServer, failure_of, localize_request, serving
 from support.small_networks import PIXEL_LIMIT, small_network
 from support.waiting import wait_until
 
-from mapless import Client, DeadlineExceeded, LocalizationResult, NewReference, Rejected, Unavailable, wire
+from mapless import Client, LocalizationResult, NewReference, Rejected, Unavailable, wire
 from mapless.geometry import Camera, RigidTransform
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.choices import NETWORKS
@@ -95,24 +95,6 @@ def test_a_random_network_is_answered_for(tmp_path: Path, name: str) -> None:
 
 
 @by_one
-def test_a_network_of_nans_gives_no_coarse_pose(tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture) -> None:
-    network = small_network(name)
-    for parameter in network.parameters():
-        parameter.data[:] = float("nan")
-    photograph = encode(".png", photograph_at(0.7))
-    with on_network(tmp_path, network, name) as (client, *_):
-        coarse = client.localize(photograph, CAMERA, "wall", ["r0", "r1", "r2"], variant="coarse")
-        answer = client.localize(photograph, CAMERA, "wall", ["r0", "r1", "r2"])
-    assert isinstance(coarse, Rejected)
-    assert coarse.reason == "SCALE_UNRELIABLE"
-    assert name in coarse.message
-    # The photograph's matches with the references need no network.
-    assert isinstance(answer, LocalizationResult)
-    assert answer.world_from_camera.translation == pytest.approx([0.7, 0, 0], abs=0.01)
-    assert f"{name}: the network's output is not finite" in [record.message for record in caplog.records]
-
-
-@by_one
 def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path, name: str) -> None:
     sizes: list[int] = []
     entered, gate = threading.Semaphore(0), threading.Event()
@@ -146,29 +128,6 @@ def test_calls_waiting_for_a_network_become_one_batch(tmp_path: Path, name: str)
         assert server.value("mapless_batch_size_count", stage="coarse") == 2
         # Each reference was encoded once: by the first query, for all of them.
         assert backend.cache.counters.misses == 4
-
-
-@by_one
-def test_a_call_whose_deadline_passes_in_the_network_fails_alone(tmp_path: Path, name: str) -> None:
-    entered, gate = threading.Semaphore(0), threading.Event()
-
-    def reconstruct(batch: Any) -> Any:
-        entered.release()
-        assert gate.wait(60)
-        return pipeline.reconstruct(batch)
-
-    photograph = encode(".png", photograph_at(0.7))
-    with (
-        ThreadPoolExecutor(1) as pool,
-        on_network(tmp_path, small_network(name), name, Method(reconstruct=reconstruct)) as (client, *_),
-    ):
-        late = pool.submit(client.localize, photograph, CAMERA, "wall", NAMES, timeout_s=1.0)
-        try:
-            assert entered.acquire(timeout=30)
-            assert isinstance(late.exception(30), DeadlineExceeded)
-        finally:
-            gate.set()
-        assert isinstance(client.localize(photograph, CAMERA, "wall", NAMES), LocalizationResult | Rejected)
 
 
 @by_one

@@ -10,15 +10,11 @@ from support.servers import CAMERA, RunningServer, pose, serving
 from support.stores import damage
 
 from mapless import (
-    Camera,
     Client,
     DataLoss,
-    InvalidArgument,
     LocalizationResult,
     NewReference,
     NotFound,
-    PositionPrior,
-    Priors,
 )
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
@@ -116,20 +112,3 @@ def test_a_damaged_reference_costs_itself_unless_it_is_named(tmp_path: Path, wha
                 continue
             with pytest.raises(DataLoss, match="'r0' is damaged"):
                 client.localize(PHOTOS[0], CAMERA, "s", ["r1", "r0"], rerank_references=is_reranked)
-
-
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [
-        ({"count": -1}, "count"),
-        ({"count": 1001}, "count"),
-        ({"priors": Priors(PositionPrior(np.zeros(3), -1.0))}, "position_prior.radius_m"),
-        ({"camera": Camera(97, 64, 80.0, 81.0, 47.5, 31.5)}, "intrinsics.width_px"),
-        ({"image": b"no image"}, "image"),
-    ],
-)
-def test_bad_requests_name_their_field(client: Client, changes: dict[str, object], field: str) -> None:
-    request = {"image": PHOTOS[0], "camera": CAMERA, "scene": "hall"} | changes
-    with pytest.raises(InvalidArgument) as caught:
-        client.retrieve_references(**request)  # type: ignore[arg-type]
-    assert caught.value.field == field

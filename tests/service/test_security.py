@@ -172,13 +172,6 @@ def test_health_and_the_interface_are_open(guarded: Guarded) -> None:
         assert "mapless.v1.ReferenceService" in {it.name for it in answer.list_services_response.service}
 
 
-def test_malformed_messages_and_methods_reveal_nothing(guarded: Guarded) -> None:
-    with grpc.insecure_channel(guarded.server.address) as channel:
-        failure = failure_of(channel.unary_unary("/mapless.v1.ReferenceService/GetScene"), b"\xff\xff")
-        assert failure.code == "UNAUTHENTICATED"
-        assert failure_of(channel.unary_unary("/mapless.v1.ReferenceService/Other"), b"").code == "UNIMPLEMENTED"
-
-
 @pytest.mark.parametrize("method", sorted(requests_on("secret")))
 def test_a_scene_of_another_tenant_is_not_there_in_any_method(guarded: Guarded, method: str) -> None:
     for stranger in ("stranger", "local"):
