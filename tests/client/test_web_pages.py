@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.chromium import Page, browsing, needs_chromium
-from support.corner import CAMERA, photograph, pose
+from support.corner import CAMERA, make_corner, photograph, pose
 from support.gateways import running_gateway
 from support.users import registry_environment
 
-from mapless import Client, ConnectOptions, LocalizationResult, NewReference
+from mapless import Client, ConnectOptions, LocalizationResult
 from mapless.geometry import Array, Camera, Quaternion, RigidTransform, rotation_from_vector
 from mapless_tools.child import child_server
 
@@ -56,11 +56,9 @@ def pages() -> Path:
 @pytest.fixture(scope="module")
 def gateway(pages: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The address of a gateway with the pages, in front of a server with a scene."""
-    poses = {f"reference-{i}": pose(angle) for i, angle in enumerate((-25, -15, -5, 5, 15, 25))}
     with child_server(tmp_path_factory.mktemp("data")) as server:
         with Client(server.address, ConnectOptions(timeout_s=120)) as client:
-            client.create_scene("corner")
-            client.add_references("corner", [NewReference(it, photograph(at), CAMERA, at) for it, at in poses.items()])
+            make_corner(client, [pose(angle) for angle in (-25, -15, -5, 5, 15, 25)])
             client.update_scene("corner", down_in_world=(0.0, 1.0, 0.0))
             assert isinstance(client.localize(photograph(TRUE), CAMERA, "corner"), LocalizationResult)
         with running_gateway(server.address, "--pages", str(pages)) as url:

@@ -8,7 +8,7 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 from support.compare import assert_pose_close
-from support.corner import photograph
+from support.corner import make_corner, photograph
 from support.corner import pose as corner_pose
 from support.images import encode
 from support.servers import pose, serving_really
@@ -41,10 +41,7 @@ BLANK = encode(".png", np.full((240, 320, 3), 90, np.uint8))
 @pytest.fixture(scope="module")
 def corner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
     with serving_really(tmp_path_factory.mktemp("corner"), workers=1) as server, Client(server.address) as client:
-        client.create_scene("corner")
-        client.add_references(
-            "corner", [NewReference(f"p{i}", photograph(it, CORNER), CORNER, it) for i, it in enumerate(STANDPOINTS)]
-        )
+        make_corner(client, STANDPOINTS, camera=CORNER)
         yield client
 
 
@@ -189,11 +186,11 @@ def test_what_shows_nothing_is_rejected_with_each_images_reason(corner: Client) 
 
 
 def test_references_may_be_named_for_each_image(corner: Client, queries: list[bytes]) -> None:
-    image = RigImage(queries[0], CORNER, RIG_FROM_CAMERA[0], ("p0", "p1", "p2"))
+    image = RigImage(queries[0], CORNER, RIG_FROM_CAMERA[0], ("r0", "r1", "r2"))
     answer = corner.localize_rig([image, image], "corner")
     assert isinstance(answer, RigLocalization)
     names = [[use.name for use in report.diagnostics.references] for report in answer.images]
-    assert names == [[f"scenes/corner/references/p{i}" for i in range(3)]] * 2
+    assert names == [[f"scenes/corner/references/r{i}" for i in range(3)]] * 2
     with pytest.raises(NotFound) as caught:
-        corner.localize_rig([image, RigImage(queries[0], CORNER, RIG_FROM_CAMERA[0], ("p0", "absent"))], "corner")
+        corner.localize_rig([image, RigImage(queries[0], CORNER, RIG_FROM_CAMERA[0], ("r0", "absent"))], "corner")
     assert caught.value.field == "images[1].references[1]"

@@ -18,7 +18,6 @@ from support.waiting import wait_until
 from mapless import (
     Client,
     Hypothesis,
-    NewReference,
     PositionPrior,
     Priors,
     Rejected,
@@ -47,10 +46,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Client, st
         child_server(folder / "data", flags, {"MAPLESS_CAPTURE_HOURS": "1"}) as server,
         Client(server.address) as client,
     ):
-        client.create_scene("corner")
-        poses = [corner.pose(it) for it in ANGLES]
-        references = [NewReference(f"r{i}", corner.photograph(it), corner.CAMERA, it) for i, it in enumerate(poses)]
-        client.add_references("corner", references)
+        corner.make_corner(client, [corner.pose(it) for it in ANGLES])
         yield client, server.address, folder
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.compare import assert_pose_close
 from support.corner import CAMERA as CORNER_CAMERA
-from support.corner import photograph
+from support.corner import make_corner, photograph
 from support.corner import pose as corner_pose
 from support.messages import essence
 from support.servers import (
@@ -27,7 +27,7 @@ from support.servers import (
 )
 from support.waiting import wait_until, with_enough_time
 
-from mapless import Client, MaplessError, NewReference, RigidTransform, wire
+from mapless import Client, MaplessError, RigidTransform, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 
@@ -125,11 +125,7 @@ ANGLES_DEG = (-24, -16, -8, 0, 8, 16, 24)
 def corner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalizationServiceStub]:
     """A server as it is shipped, with a scene of a papered corner."""
     with serving_really(tmp_path_factory.mktemp("corner"), workers=1) as server, Client(server.address) as client:
-        client.create_scene("s")
-        poses = [corner_pose(angle) for angle in ANGLES_DEG]
-        client.add_references(
-            "s", [NewReference(f"r{i}", photograph(it), CORNER_CAMERA, it) for i, it in enumerate(poses)]
-        )
+        make_corner(client, [corner_pose(angle) for angle in ANGLES_DEG], "s")
         with grpc.insecure_channel(server.address) as channel:
             yield LocalizationServiceStub(channel)
 

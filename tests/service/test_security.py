@@ -14,7 +14,7 @@ import pytest
 from google.protobuf.message import Message
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from support.certificates import authority, options_of, signed
-from support.servers import CAMERA, PHOTO, RunningServer, failure_of, localize_request, make_scene, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, failure_of, localize_request, pose, serving
 from support.waiting import wait_until
 
 from mapless import (
@@ -28,7 +28,6 @@ from mapless import (
     Unauthenticated,
     Unavailable,
 )
-from mapless.errors import from_rpc_error
 from mapless.requests import create_request
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
@@ -205,39 +204,6 @@ def test_each_tenant_has_its_own_scene_under_the_same_name(guarded: Guarded) -> 
     )
     assert [it.name for it in answer.diagnostics.references] == ["scenes/shared/references/r"]
     assert "acme" not in str(answer)
-
-
-def test_page_tokens_are_good_for_their_tenant_and_list(guarded: Guarded) -> None:
-    for caller in ("writer", "stranger"):
-        with guarded.client(caller) as client:
-            make_scene(client, "paged", 2)
-    asked: dict[str, Any] = {
-        "ListScenes": reference_pb.ListScenesRequest(page_size=1),
-        "ListReferences": reference_pb.ListReferencesRequest(scene="scenes/paged", page_size=1),
-        "AuditScene": reference_pb.AuditSceneRequest(scene="scenes/paged", page_size=1),
-    }
-
-    def answer(method: str, token: str, caller: str) -> bytes:
-        asked[method].page_token = token
-        page: bytes = guarded.call(REFERENCE_SERVICE + method, asked[method], guarded.tokens[caller])
-        return page
-
-    given = {}
-    for method in asked:
-        kind = getattr(reference_pb, f"{method}Response")
-        given[method] = kind.FromString(answer(method, "", "writer")).next_page_token
-    for method in asked:
-        for giver, token in given.items():
-            for caller in ("writer", "stranger"):
-                if (giver, caller) == (method, "writer"):
-                    assert answer(method, token, caller)
-                    continue
-                with pytest.raises(grpc.RpcError) as caught:
-                    answer(method, token, caller)
-                assert from_rpc_error(caught.value).field == "page_token"
-    for caller in ("writer", "stranger"):
-        with guarded.client(caller) as client:
-            client.delete_scene("paged")
 
 
 def test_a_token_that_is_made_or_revoked_while_the_server_runs(guarded: Guarded) -> None:

@@ -1,6 +1,7 @@
 """Requests that the services refuse by the field that is wrong, before anything is computed, read or stored."""
 
 import asyncio
+import base64
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -71,6 +72,11 @@ GOOD: dict[str, Message] = {
     "ListScenes": reference_pb.ListScenesRequest(),
     "DeleteScene": reference_pb.DeleteSceneRequest(name=SCENE),
 }
+
+
+def token_of(tenant: str, collection: str) -> str:
+    """Of the page after item r1 of a list."""
+    return base64.urlsafe_b64encode(f"{tenant}\n{collection}\nr1".encode()).decode()
 
 
 def refusal(method: str, request: Message) -> FieldError | RequestError:
@@ -169,7 +175,12 @@ BAD: dict[str, list[Case]] = {
         ("image", b"no image"),
         ("mask", b""),
     ],
-    "AuditScene": [("page_size", -1), ("references", [REFERENCE] * 2, "references[1]")],
+    "AuditScene": [
+        ("page_size", -1),
+        ("page_token", token_of("acme", SCENE)),
+        ("page_token", token_of("other", f"{SCENE} audit")),
+        ("references", [REFERENCE] * 2, "references[1]"),
+    ],
     "CheckCoverage": [("world_from_camera", None), ("intrinsics", None)],
     "BatchCreateReferences": [
         ("requests", None),
@@ -190,7 +201,12 @@ BAD: dict[str, list[Case]] = {
     ],
     "CreateReference": [("scene", "s"), ("reference_id", ".."), ("reference.mask", b"")],
     "GetReference": [("name", SCENE), ("name", "scenes/../references/x")],
-    "ListReferences": [("scene", REFERENCE), ("page_size", -1), ("page_token", "r1"), ("page_token", "€")],
+    "ListReferences": [
+        ("scene", REFERENCE),
+        ("page_size", -1),
+        *(("page_token", it) for it in ("r1", "€", token_of("other", SCENE), token_of("acme", "scenes"))),
+        *(("page_token", token_of("acme", it)) for it in ("scenes/t", f"{SCENE} audit")),
+    ],
     "DeleteReference": [("name", "scenes/../references/x")],
     "CreateScene": [
         ("scene_id", ".."),
@@ -222,7 +238,7 @@ BAD: dict[str, list[Case]] = {
         ("scene.calibration.reference_noise_deg", INFINITY),
         ("scene.calibration.backend", "x" * 129),
     ],
-    "ListScenes": [("page_size", -1), ("page_token", "x")],
+    "ListScenes": [("page_size", -1), *(("page_token", token_of("acme", it)) for it in (SCENE, f"{SCENE} audit"))],
     "DeleteScene": [("name", REFERENCE)],
 }
 CASES = [(method, case) for method, cases in BAD.items() for case in cases]

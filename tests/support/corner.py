@@ -1,9 +1,12 @@
 """Photographs of a corner of a room, rendered in milliseconds: three papered walls, full of features."""
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapless import Client, NewReference
 from mapless.geometry import Camera, RigidTransform
 from support.images import encode
 from support.scenes import look_at
@@ -53,3 +56,12 @@ def pose(angle_deg: float, height_m: float = -1.6, distance_m: float = 3.4) -> R
     """``world_from_camera`` that looks into the corner from an angle, 0 along its middle."""
     angle = np.radians(45 + angle_deg)
     return look_at(np.array([-distance_m * np.cos(angle), height_m, -distance_m * np.sin(angle)]), [-0.5, -1.2, -0.5])
+
+
+def make_corner(
+    client: Client, poses: Sequence[RigidTransform], scene_id: str = "corner", camera: Camera = CAMERA
+) -> None:
+    """A scene of photographs from these poses, r0, r1, and so on."""
+    client.create_scene(scene_id)
+    added = [NewReference(f"r{i}", photograph(it, camera), camera, it) for i, it in enumerate(poses)]
+    client.add_references(scene_id, added)

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.chromium import Page, browsing, needs_chromium
-from support.corner import CAMERA, photograph, pose
+from support.corner import CAMERA, make_corner, photograph, pose
 from support.gateways import running_command
 
-from mapless import Client, ConnectOptions, LocalizationResult, NewReference
+from mapless import Client, ConnectOptions, LocalizationResult
 from mapless_tools.child import child_server
 
 pytest.importorskip("viser", reason="needs the extra view")
 
-REFERENCES = [f"reference-{i}" for i in range(6)]
 YELLOW, GREEN = (255, 190, 60), (46, 230, 166)
 TOP_PX = 220
 
@@ -55,13 +54,11 @@ def switch(page: Page, label: str) -> None:
 @pytest.mark.nightly
 @needs_chromium()
 def test_what_is_seen_in_a_browser(tmp_path: Path) -> None:
-    poses = dict(zip(REFERENCES, map(pose, (-25, -15, -5, 5, 15, 25)), strict=True))
     with (
         child_server(tmp_path / "data", environment={"MAPLESS_ALLOW_WATCHING": "true"}) as server,
         Client(server.address, ConnectOptions(timeout_s=120)) as client,
     ):
-        client.create_scene("corner")
-        client.add_references("corner", [NewReference(it, photograph(at), CAMERA, at) for it, at in poses.items()])
+        make_corner(client, [pose(angle) for angle in (-25, -15, -5, 5, 15, 25)])
         with view(server.address, "corner") as url, browsing(url) as page:
             look(page, client, tmp_path)
 
