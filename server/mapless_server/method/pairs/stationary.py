@@ -76,8 +76,8 @@ def stationary_matches(
     same = np.flatnonzero(moved_px <= options.same_px)
     if not len(same):
         return found
-    pixels, others = (it.view.features.keypoints[matches[same, side]] for side, it in enumerate((first, second)))
-    off_px = distance_from_explained_px(first, second, pixels.astype(np.float64), others.astype(np.float64))
+    pixels, others = (it.view.features.pixels(matches[same, side]) for side, it in enumerate((first, second)))
+    off_px = distance_from_explained_px(first, second, pixels, others)
     same = same[off_px > options.contradicted_px * second.view.camera.width_px / MAX_SIDE_PX]
     if len(same) and not show_same_view(first.view, second.view, matches[moved_px <= options.unmoved_px], options):
         found[same] = True

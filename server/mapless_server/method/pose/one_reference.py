@@ -22,7 +22,7 @@ from ..bundle.dispersion import scale_covariance
 from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, ReconstructedView, View
-from ..optim.optimize import motion_jacobian, perturbed, world_covariance
+from ..optim.optimize import cauchy_weight, motion_jacobian, perturbed, world_covariance
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import MetricScale, PixelPoints, PointMatches, Structure
@@ -198,8 +198,7 @@ def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
     for iteration in range(ITERATIONS):
         rows = _linearize(problem, pose)
         distance = _distances(rows, sigma_px, depth_sigma)
-        weight = np.where(np.isfinite(distance), 1 / (1 + np.square(distance / 2)), 0.0)
-        information = rows.information(sigma_px, depth_sigma) * weight[:, None, None]
+        information = rows.information(sigma_px, depth_sigma) * cauchy_weight(distance**2, 2.0)[:, None, None]
         hessian = np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose)
         gradient = np.einsum("mia,mij,mj->a", rows.by_pose, information, rows.residual)
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
@@ -221,7 +220,7 @@ def _noise(rows: _Rows, inliers: NDArray[np.bool_]) -> tuple[float, float]:
     across = direction[:, 0] * residual[:, 1] - direction[:, 1] * residual[:, 0]
     sigma_px = max(MIN_SIGMA_PX, MAD_TO_SIGMA * float(np.median(np.abs(across))))
     # Errors of depth show only where they move a projection by more than a keypoint errs.
-    shows = length * MAX_DEPTH_SIGMA > 3 * sigma_px
+    shows = length * MAX_DEPTH_SIGMA > INLIER_SIGMA * sigma_px
     if shows.sum() < MIN_INLIERS:
         return sigma_px, FIRST_DEPTH_SIGMA
     along = (direction * residual).sum(axis=1)[shows]

@@ -29,7 +29,8 @@ WRONG_SHARE = 0.4
 """Share of bad pairs above which more than single photographs are wrong, one of which makes one pair in five bad."""
 
 FEW_SHARE = 0.25
-"""Largest share of exceptions: of bad pairs where the poses should fit, of good pairs where they should not."""
+"""Largest share of exceptions: of bad pairs where the poses should fit, of good pairs where they should not. Evidence:
+readings."""
 
 
 def distinct_matches(first: View, second: View) -> Matches:
