@@ -30,6 +30,7 @@ from mapless_server.store import (
 )
 
 from .messages.queries import (
+    message_of,
     photo_from_message,
     priors_from_message,
     reference_ids_from_names,
@@ -43,7 +44,6 @@ from .messages.references import (
     audit_to_message,
     changes_from_message,
     choice_to_message,
-    coverage_to_message,
     nearly_ignored,
     reference_to_message,
     scene_to_message,
@@ -287,10 +287,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         pose = wire.transform_from_message(request.world_from_camera, "world_from_camera", MAX_COORDINATE_M)
         view = Viewpoint(wire.camera_from_message(request.intrinsics, "intrinsics"), pose)
         generation, coverage = await engine.check_coverage(scene_key, view, call.caller)
-        message = coverage_to_message(coverage)
-        message.store_generation = generation
-        message.arbitrary_unit = (await self._stored(self._store.get_scene, scene_key)).attributes.arbitrary_unit
-        return message
+        is_arbitrary = (await self._stored(self._store.get_scene, scene_key)).attributes.arbitrary_unit
+        return message_of(coverage, pb.CheckCoverageResponse, store_generation=generation, arbitrary_unit=is_arbitrary)
 
     def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
         """Reads a reference and checks all but its pixels; FieldError or InvalidArgument names the wrong field."""

@@ -10,14 +10,12 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
 from mapless_server.engine.query import Result
 from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance, viewpoint_gap
-from mapless_server.method.bundle.priors import PriorCheck
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.rejection import Hint, IntrinsicsCheck, PoseHypothesis, Rejection
-from mapless_server.method.structure.model import MetricScale
+from mapless_server.method.rejection import PoseHypothesis, Rejection
 from mapless_server.store import SceneAttributes
 
-from .queries import enum_from_message, enum_to_message
+from .queries import enum_from_message, enum_to_message, message_of
 from .radii import Conditions, ReportedRadii, reported_radii
 
 
@@ -82,9 +80,9 @@ def _localization_to_message(
         match_count=localization.match_count,
         reprojection_error_px=localization.reprojection_error_px,
         trust=localization.trust,
-        prior_checks=[check_to_message(check) for check in localization.prior_checks],
+        prior_checks=[message_of(check, pb.PriorCheck) for check in localization.prior_checks],
         scale_source=enum_to_message(localization.scale_source, pb.ScaleSource),
-        intrinsics_checks=[_intrinsics_check_to_message(check) for check in localization.intrinsics_checks],
+        intrinsics_checks=[message_of(check, pb.IntrinsicsCheck) for check in localization.intrinsics_checks],
     )
     _set_radii(message, localization.world_from_camera, radii, attributes, frames)
     message.arbitrary_unit = attributes.arbitrary_unit
@@ -131,25 +129,14 @@ def accuracy_to_message(radii: ReportedRadii) -> pb.Accuracy:
     )
 
 
-def check_to_message(check: PriorCheck) -> pb.PriorCheck:
-    """Message of a prior's check."""
-    return pb.PriorCheck(
-        kind=enum_to_message(check.kind, pb.PriorKind),
-        mahalanobis=check.mahalanobis,
-        degrees_of_freedom=check.degrees_of_freedom,
-        conflict=check.conflict,
-        used=check.used,
-    )
-
-
 def rejection_to_message(rejection: Rejection) -> pb.Rejection:
     """Message of a rejection, without a pose that is rejected for its radius alone."""
     return pb.Rejection(
         reason=enum_to_message(rejection.reason, pb.RejectionReason),
         message=rejection.message,
-        hint=_hint_to_message(rejection.hint) if rejection.hint else None,
+        hint=message_of(rejection.hint, pb.Hint) if rejection.hint else None,
         hypotheses=[_hypothesis_to_message(it) for it in rejection.hypotheses],
-        intrinsics_checks=[_intrinsics_check_to_message(check) for check in rejection.intrinsics_checks],
+        intrinsics_checks=[message_of(check, pb.IntrinsicsCheck) for check in rejection.intrinsics_checks],
     )
 
 
@@ -158,27 +145,6 @@ def _hypothesis_to_message(hypothesis: PoseHypothesis) -> pb.Hypothesis:
         world_from_camera=wire.transform_to_message(hypothesis.world_from_camera),
         inlier_count=hypothesis.inlier_count,
         references=hypothesis.references,
-    )
-
-
-def _intrinsics_check_to_message(check: IntrinsicsCheck) -> pb.IntrinsicsCheck:
-    return pb.IntrinsicsCheck(
-        parameter=enum_to_message(check.parameter, pb.IntrinsicsParameter),
-        given=check.given,
-        estimated=check.estimated,
-        estimated_sigma=check.estimated_sigma,
-        given_sigma=check.given_sigma,
-        conflict=check.conflict,
-        used=check.used,
-    )
-
-
-def _hint_to_message(hint: Hint) -> pb.Hint:
-    return pb.Hint(
-        stage=hint.stage,
-        advice=enum_to_message(hint.advice, pb.Advice),
-        message=hint.message,
-        best_reference=hint.best_reference or "",
     )
 
 
@@ -191,7 +157,7 @@ def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagn
         features=tier.features,
         variant=enum_to_message(options.variant, pb.Variant),
         store_generation=result.generation,
-        scale=_scale_to_message(answer.scale) if answer.scale else None,
+        scale=message_of(answer.scale, pb.ScaleEstimate) if answer.scale else None,
         processed_width_px=result.processed.width_px,
         processed_height_px=result.processed.height_px,
         server_version=__version__,
@@ -229,14 +195,6 @@ def _reference_uses(result: Result) -> list[pb.ReferenceUse]:
         )
         for reference, matches, inliers in zip(result.references, match_counts, inlier_counts, strict=True)
     ]
-
-
-def _scale_to_message(scale: MetricScale) -> pb.ScaleEstimate:
-    return pb.ScaleEstimate(
-        metres_per_unit=scale.metres_per_unit,
-        stage=enum_to_message(scale.stage, pb.ScaleStage),
-        deviation=scale.deviation,
-    )
 
 
 MAX_SESSION_COORDINATE_M = 1e7

@@ -26,7 +26,6 @@ from .answers import (
     AnswerFrames,
     accuracy_to_message,
     axes_from_message,
-    check_to_message,
     covariance_to_message,
     diagnostics_to_message,
     geo_pose_to_message,
@@ -38,6 +37,7 @@ from .queries import (
     MAX_REFERENCES,
     check_capture_time,
     enum_to_message,
+    message_of,
     options_from_message,
     photo_from_message,
     priors_from_message,
@@ -249,7 +249,7 @@ def _reports(
         report.diagnostics.processor_duration.FromNanoseconds(round(1e9 * group.processor_s[i]))
         if isinstance(alone.outcome, Rejection):
             report.alone.CopyFrom(result_to_rejection(result, query.options, frames[i]))
-        report.prior_checks.extend(map(check_to_message, checks.get(i, ())))
+        report.prior_checks.extend(message_of(it, pb.PriorCheck) for it in checks.get(i, ()))
         if i in matched:
             report.inlier_count = int(matched[i].inliers.sum())
             report.match_count = len(matched[i].matches)

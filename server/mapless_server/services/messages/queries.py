@@ -12,6 +12,8 @@ from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import Message
 
 from mapless import names, wire
 from mapless.geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, GeoPosition, world_from_enu_at, world_from_geodetic
@@ -43,12 +45,28 @@ FIRST_TIME_S, LAST_TIME_S = -62_135_596_800, 253_402_300_799
 """Range of google.protobuf.Timestamp."""
 
 E = TypeVar("E", bound=Enum)
+MessageT = TypeVar("MessageT", bound=Message)
 
 
 @cache
 def enum_to_message(value: Enum, enum: wire.ProtoEnum) -> Any:
     """The protobuf number of a value."""
     return enum.Value(wire.enum_prefix(enum) + value.name)
+
+
+def message_of(value: object, kind: type[MessageT], **others: Any) -> MessageT:
+    """The message of a value whose attributes have the names of the message's fields, all but `others`.
+
+    Enums are converted by their names; None leaves a field empty. AttributeError if the value lacks an attribute.
+    """
+    given = {it: getattr(value, it.name) for it in kind.DESCRIPTOR.fields if it.name not in others}
+    fields = {it.name: _number_of(found, it) if isinstance(found, Enum) else found for it, found in given.items()}
+    return kind(**fields, **others)
+
+
+def _number_of(value: Enum, field: FieldDescriptor) -> int:
+    values = field.enum_type.values
+    return next(it.number for it in values if it.name == values[0].name.removesuffix("UNSPECIFIED") + value.name)
 
 
 def enum_from_message(number: int, enum: wire.ProtoEnum, default: E, field: str) -> E:

@@ -17,10 +17,10 @@ from mapless.scenes import (
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError, joined
-from mapless_server.scenes import Choice, Coverage, ReferenceAudit
+from mapless_server.scenes import Choice, ReferenceAudit
 from mapless_server.store import ContradictingDown, DatumWithoutMetres, ReferenceRecord, SceneAttributes, SceneRecord
 
-from .queries import enum_to_message
+from .queries import message_of
 
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000
@@ -115,31 +115,7 @@ def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesRes
 
 def audit_to_message(audit: ReferenceAudit) -> pb.ReferenceAudit:
     """Message of an audit; unknown values become 0."""
-    return pb.ReferenceAudit(
-        name=audit.reference,
-        verdict=enum_to_message(audit.verdict, pb.AuditVerdict),
-        message=audit.message,
-        neighbour_count=audit.neighbour_count,
-        match_count=audit.match_count,
-        inlier_count=audit.inlier_count,
-        reprojection_error_px=audit.error_px or 0.0,
-        position_offset_m=audit.position_offset_m or 0.0,
-        rotation_offset_deg=audit.rotation_offset_deg or 0.0,
-        focal_ratio=audit.focal_ratio or 0.0,
-        other=audit.other,
-    )
-
-
-def coverage_to_message(coverage: Coverage) -> pb.CheckCoverageResponse:
-    """Message of a coverage check, without the generation."""
-    return pb.CheckCoverageResponse(
-        verdict=enum_to_message(coverage.verdict, pb.CoverageVerdict),
-        message=coverage.message,
-        expected_match_count=coverage.expected_match_count,
-        image_share=coverage.image_share,
-        position_68_m=coverage.position_68_m or 0.0,
-        references=coverage.references,
-    )
+    return message_of(audit, pb.ReferenceAudit, name=audit.reference, reprojection_error_px=audit.error_px)
 
 
 def scene_to_message(scene: SceneRecord) -> pb.Scene:
