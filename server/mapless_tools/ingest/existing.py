@@ -17,7 +17,7 @@ _SAME_SHARE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """The identity of a reference."""
+    """The identity of a reference that is to be stored, as a `Reference` of the server has it."""
 
     reference_id: str
     image_sha256: str
@@ -26,17 +26,20 @@ class Stored:
     mask_sha256: str = ""
 
 
+Identity = Stored | Reference
+
+
 class KnownReferences:
     """References of a scene by id and by image, and those that this import is adding; thread-safe."""
 
     def __init__(self, references: Iterable[Reference]) -> None:
         self._lock = threading.Lock()
-        self._by_id: dict[str, Stored] = {}
-        self._by_image: dict[str, Stored] = {}
+        self._by_id: dict[str, Identity] = {}
+        self._by_image: dict[str, Identity] = {}
         for reference in references:
-            self._remember(stored_of(reference))
+            self._remember(reference)
 
-    def claim(self, new: Stored) -> Stored | None:
+    def claim(self, new: Stored) -> Identity | None:
         """Returns the reference that already has this id or this image; if there is none, enters the new one.
 
         An image is enough to be the same photograph: a second id for it would be the same reference twice.
@@ -54,26 +57,15 @@ class KnownReferences:
                 if index.get(key) is stored:
                     del index[key]
 
-    def _remember(self, stored: Stored) -> None:
+    def _remember(self, stored: Identity) -> None:
         self._by_id[stored.reference_id] = stored
         self._by_image.setdefault(stored.image_sha256, stored)
-
-
-def stored_of(reference: Reference) -> Stored:
-    """The identity of a reference of the server."""
-    return Stored(
-        reference.reference_id,
-        reference.image_sha256,
-        reference.camera,
-        reference.world_from_camera,
-        reference.mask_sha256,
-    )
 
 
 _MASKED = {False: "it has no mask", True: "it has a mask"}
 
 
-def difference(there: Stored, new: Stored) -> str:
+def difference(there: Identity, new: Stored) -> str:
     """Says in what two references differ besides their ids; empty if they are the same."""
     if there.image_sha256 != new.image_sha256:
         return "its image differs"

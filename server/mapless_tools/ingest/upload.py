@@ -22,7 +22,7 @@ from mapless_server.images import ImageLimits, check_mask, image_size
 from mapless_tools.dataset import Frame, Refusal
 from mapless_tools.progress import Progress
 
-from .existing import KnownReferences, Stored, difference, stored_of
+from .existing import Identity, KnownReferences, Stored, difference
 from .formats.collecting import ANY_SIZE
 from .report import ALREADY_THERE, ImportReport
 
@@ -137,13 +137,13 @@ class Uploader:
         ((new, stored),) = items
         self._known.forget(stored)
         if isinstance(error, errors.AlreadyExists):  # by another caller, meanwhile
-            self._duplicate(stored_of(self._client.get_reference(self._report.scene, new.reference_id)), stored)
+            self._duplicate(self._client.get_reference(self._report.scene, new.reference_id), stored)
             return
         field = _REQUEST.sub("", error.field or "").lstrip(".")
         request = f" (request {error.request_id})" if isinstance(error, errors.Internal) else ""
         self._refuse(new.reference_id, f"{f'{field}: ' if field else ''}{error.message}{request}")
 
-    def _duplicate(self, there: Stored, new: Stored) -> None:
+    def _duplicate(self, there: Identity, new: Stored) -> None:
         what = difference(there, new)
         here = "" if there.reference_id == new.reference_id else f"the same image as {there.reference_id}"
         if not what:
