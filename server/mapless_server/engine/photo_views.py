@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 
 from mapless_server.images import ImageLimits, decode_image
@@ -64,8 +65,8 @@ class QueryViews:
 
     def in_form(self, form: RasterForm) -> QueryViews:
         """The same photograph, decoded once, whose features are found in another raster."""
-        views = object.__new__(QueryViews)
-        views.form, views._decoded = form, self._decoded
+        views = copy(self)
+        views.form = form
         return views
 
     def view(self, extractor: FeatureExtractor, context: StageContext) -> View:

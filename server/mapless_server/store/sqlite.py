@@ -13,6 +13,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from enum import Enum, auto
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -57,6 +58,23 @@ def has_wal_reset_bug(version: tuple[int, int, int]) -> bool:
     """
     fixed_on_branch = (3, 44, 6) <= version < (3, 45, 0) or (3, 50, 7) <= version < (3, 51, 0)
     return (3, 7, 0) <= version < (3, 51, 3) and not fixed_on_branch
+
+
+class Use(Enum):
+    """What a file is opened for; it is created if missing, unless it is only read."""
+
+    WRITE = auto()
+    SCRATCH = auto()
+    """To be written; it may be lost."""
+    READ = auto()
+    """To be read while others may write it."""
+    UNCHANGING = auto()
+    """To be read while no process writes it: no lock is taken, and no file created beside it."""
+
+    @property
+    def only_reads(self) -> bool:
+        """Whether the file is not written."""
+        return self in (Use.READ, Use.UNCHANGING)
 
 
 class SqliteDatabase:
@@ -114,7 +132,7 @@ class SqliteDatabase:
             folder_lock = FolderLock.share(path)
         except OSError as error:
             raise StoreError(f"database {path} cannot be read: {error.strerror}") from error
-        database = SqliteDatabase(create_sqlite_engine(path, only_reads=True, never_changes=True), folder_lock, True)
+        database = SqliteDatabase(create_sqlite_engine(path, Use.UNCHANGING), folder_lock, True)
         with database._faults_as_store_errors(), database.read() as connection:
             version = read_version(connection)
             if version != SCHEMA_VERSION:
@@ -130,7 +148,7 @@ class SqliteDatabase:
 
         StoreError as in `open`.
         """
-        return SqliteDatabase._opened(path, None, is_scratch=True)
+        return SqliteDatabase._opened(path, None, Use.SCRATCH)
 
     @staticmethod
     def open_as_is(path: Path) -> SqliteDatabase:
@@ -140,15 +158,15 @@ class SqliteDatabase:
         """
         if not path.is_file():
             raise StoreError(f"there is no database {path}")
-        database = SqliteDatabase(create_sqlite_engine(path, only_reads=True), None)
+        database = SqliteDatabase(create_sqlite_engine(path, Use.READ), None)
         with database._faults_as_store_errors(), database.read() as connection:
             if read_version(connection) is None:
                 raise ValueError("it is empty")
         return database
 
     @staticmethod
-    def _opened(path: Path, folder_lock: FolderLock | None, is_scratch: bool = False) -> SqliteDatabase:
-        database = SqliteDatabase(create_sqlite_engine(path, is_scratch=is_scratch), folder_lock)
+    def _opened(path: Path, folder_lock: FolderLock | None, use: Use = Use.WRITE) -> SqliteDatabase:
+        database = SqliteDatabase(create_sqlite_engine(path, use), folder_lock)
         with database._faults_as_store_errors():
             database._migrate()
         return database
@@ -275,14 +293,8 @@ def _explain(error: DBAPIError, name: str) -> str:
     return fault
 
 
-def create_sqlite_engine(
-    path: Path, only_reads: bool = False, is_scratch: bool = False, never_changes: bool = False
-) -> Engine:
-    """Makes connections to a file, created if missing, each configured for a store that must not lose anything.
-
-    If it `only_reads`, the file must exist, and is not changed. A file `is_scratch` if it may be lost. If it
-    `never_changes`, no process writes it, so no lock is taken and no file created beside it.
-    """
+def create_sqlite_engine(path: Path, use: Use = Use.WRITE) -> Engine:
+    """Makes connections to a file, each configured for a store that must not lose anything."""
     library = choose_library()
     safe_mode = has_wal_reset_bug(library.sqlite_version_info)
     if safe_mode:
@@ -292,10 +304,10 @@ def create_sqlite_engine(
         )
     # WAL with FULL, and a rollback journal with EXTRA, keep every acknowledged commit through a power failure.
     journal_mode, synchronous = ("delete", "EXTRA") if safe_mode else ("wal", "FULL")
-    if is_scratch:
+    if use is Use.SCRATCH:
         journal_mode, synchronous = "off", "OFF"
     engine = create_engine(
-        _url_of(path, only_reads, never_changes),
+        _url_of(path, use),
         module=library,
         max_overflow=-1,  # bounded by the number of threads, which use one connection each
         hide_parameters=True,  # an error's text must not carry image bytes into the log
@@ -316,7 +328,7 @@ def create_sqlite_engine(
             "secure_delete=ON",  # otherwise deleted photographs stay in the file until they are overwritten
         ):
             cursor.execute(f"PRAGMA {setting}")
-        if only_reads:
+        if use.only_reads:
             cursor.execute("PRAGMA query_only=ON")
             return
         (mode_in_use,) = cursor.execute(f"PRAGMA journal_mode={journal_mode}").fetchone()
@@ -330,12 +342,12 @@ def create_sqlite_engine(
     return engine
 
 
-def _url_of(path: Path, only_reads: bool, never_changes: bool) -> URL:
-    url = URL.create("sqlite", database=str(path))
-    if only_reads:
-        # With a URI a missing file is not created. The mode is not read-only, because readers share WAL's index.
-        url = URL.create("sqlite", database=f"{_URI_PREFIX}{quote(str(path))}", query={"mode": "rw", "uri": "true"})
-    return url.update_query_dict({"mode": "ro", "immutable": "1"}) if never_changes else url
+def _url_of(path: Path, use: Use) -> URL:
+    if not use.only_reads:
+        return URL.create("sqlite", database=str(path))
+    # With a URI a missing file is not created. The mode is not read-only, because readers share WAL's index.
+    mode = {"mode": "rw"} if use is Use.READ else {"mode": "ro", "immutable": "1"}
+    return URL.create("sqlite", database=f"{_URI_PREFIX}{quote(str(path))}", query={**mode, "uri": "true"})
 
 
 def choose_library() -> ModuleType:
