@@ -19,7 +19,6 @@ from .records import (
     SceneAttributes,
     SceneChanges,
     SceneRecord,
-    SceneSnapshot,
     SelfCalibration,
     calibration_kind,
 )
@@ -37,7 +36,6 @@ __all__ = [
     "SceneAttributes",
     "SceneChanges",
     "SceneRecord",
-    "SceneSnapshot",
     "SelfCalibration",
     "Store",
     "StoreError",

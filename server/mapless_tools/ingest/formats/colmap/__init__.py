@@ -107,8 +107,6 @@ def _world_from_camera(image: ImageRecord) -> RigidTransform:
     return RigidTransform(rotation, np.array(translation)).inverse()
 
 
-__all__ = ["fits", "read"]
-
 _SAMPLE = 50
 
 
