@@ -20,8 +20,7 @@ import numpy as np
 from support.images import cmyk_jpeg, encode, textured, with_exif_orientation
 
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ImageLimits, decode_image, image_size
-from mapless_tools.ingest.formats.collecting import ANY_SIZE
+from mapless_server.images import ANY_SIZE, ImageLimits, decode_image, image_size
 
 from .target import MutateBytes, Target
 

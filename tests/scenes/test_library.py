@@ -17,10 +17,10 @@ from support.stores import damage
 
 from mapless.geometry import Camera
 from mapless_server.errors import DataLoss, NotFound, RequestError
-from mapless_server.images import ImageLimits
+from mapless_server.images import ANY_SIZE, ImageLimits
 from mapless_server.method.features.views import Ignored, View
 from mapless_server.method.options import StageContext
-from mapless_server.scenes.library import STORED_IMAGES, FeaturesMissing, Loaded, ReferenceLibrary, load_usable
+from mapless_server.scenes.library import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
 
@@ -112,9 +112,9 @@ class TestPhotographs:
             reference.view.photograph.read()
 
     def test_todays_limits_do_not_shut_out_what_was_let_in_before(self) -> None:
-        assert STORED_IMAGES.max_bytes >= 1024 * 2**20, "the largest message that can be set"
-        assert STORED_IMAGES.max_pixels >= 268_000_000, "the largest image that can be set"
-        assert STORED_IMAGES.max_side_px >= ImageLimits().max_side_px
+        assert ANY_SIZE.max_bytes >= 1024 * 2**20, "the largest message that can be set"
+        assert ANY_SIZE.max_pixels >= 268_000_000, "the largest image that can be set"
+        assert ANY_SIZE.max_side_px >= ImageLimits().max_side_px
 
 
 class TestDescribing:

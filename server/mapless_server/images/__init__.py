@@ -3,7 +3,7 @@
 Imports only `mapless_server.errors`. Begin with `decode`.
 """
 
-from .decode import ImageLimits, decode_image, image_size
+from .decode import ANY_SIZE, ImageLimits, decode_image, image_size
 from .masks import check_mask, decode_mask
 
-__all__ = ["ImageLimits", "check_mask", "decode_image", "decode_mask", "image_size"]
+__all__ = ["ANY_SIZE", "ImageLimits", "check_mask", "decode_image", "decode_mask", "image_size"]

@@ -49,6 +49,10 @@ class ImageLimits:
     max_side_px: int = 16384
 
 
+ANY_SIZE = ImageLimits(max_bytes=2**40, max_pixels=2**40, min_side_px=1, max_side_px=2**30)
+"""For images whose header alone is read, and for stored ones, which were accepted with the limits of their time."""
+
+
 def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[int, int]:
     """Width and height of an image, pixels, from its header alone.
 

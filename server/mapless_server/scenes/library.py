@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mapless.names import reference_name
 from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, RequestError, Unavailable
-from mapless_server.images import ImageLimits, decode_image, decode_mask
+from mapless_server.images import ANY_SIZE, decode_image, decode_mask
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
 from mapless_server.method.options import StageContext
@@ -26,9 +26,6 @@ from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttri
 from .stored import DepthFinder
 
 log = logging.getLogger(__name__)
-
-STORED_IMAGES = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, max_side_px=2**20)
-"""Stored photographs were accepted with the limits of their time; lower limits do not make them unreadable."""
 
 _POLL_S = 0.05
 
@@ -200,7 +197,7 @@ class ReferenceLibrary:
         """Reads the photograph, (H, W, 3) RGB; NotFound if the reference was deleted, DataLoss if it is damaged."""
         data = self._store.read_image_of(record.key)
         try:
-            return decode_image(data, STORED_IMAGES)
+            return decode_image(data, ANY_SIZE)
         except InvalidArgument as error:
             raise DataLoss(f"the photograph of reference {record.reference_id!r} cannot be read: {error}") from error
 
@@ -210,7 +207,7 @@ class ReferenceLibrary:
             return None
         data = self._store.read_mask_of(record.key)
         try:
-            return decode_mask(data, (record.camera.width_px, record.camera.height_px), STORED_IMAGES)
+            return decode_mask(data, (record.camera.width_px, record.camera.height_px), ANY_SIZE)
         except InvalidArgument as error:
             raise DataLoss(f"the mask of reference {record.reference_id!r} cannot be read: {error}") from error
 

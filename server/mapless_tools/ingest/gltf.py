@@ -19,7 +19,7 @@ from mapless import Client, LocalizationResult, MaplessError, Reference
 from mapless import Scene as KnownScene
 from mapless.geometry import Array, Quaternion, RigidTransform
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ImageLimits, decode_image
+from mapless_server.images import ANY_SIZE, decode_image
 from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 from mapless_tools.view.scenery import Scenery, lay_out
@@ -47,10 +47,6 @@ class View:
     colours: NDArray[np.uint8] | None = None
 
 
-_LIMITS = ImageLimits(max_bytes=2**31, max_pixels=2**30, min_side_px=1, max_side_px=2**20)
-"""As good as none: images that a server stores have passed its own limits."""
-
-
 def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) -> Export:
     """Writes SCENE.glb into a folder; see `export_scene`."""
     known = client.get_scene(scene)
@@ -60,7 +56,7 @@ def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) ->
         if reference.image is None:
             return View(reference)
         try:
-            image = np.ascontiguousarray(decode_image(reference.image, _LIMITS)[..., ::-1])
+            image = np.ascontiguousarray(decode_image(reference.image, ANY_SIZE)[..., ::-1])
         except InvalidArgument:
             return View(reference)
         points = _points(client, scene, reference, image) if next(left, None) is not None else (None, None)

@@ -18,12 +18,11 @@ from typing import NoReturn
 
 from mapless import Client, NewReference, errors
 from mapless_server.errors import InvalidArgument as BadImage
-from mapless_server.images import ImageLimits, check_mask, image_size
+from mapless_server.images import ANY_SIZE, ImageLimits, check_mask, image_size
 from mapless_tools.dataset import Frame, Refusal
 from mapless_tools.progress import Progress
 
 from .existing import Identity, KnownReferences, Stored, difference
-from .formats.collecting import ANY_SIZE
 from .report import ALREADY_THERE, ImportReport
 
 BATCH_COUNT = 8

@@ -16,7 +16,7 @@ from mapless.cameras import MAX_SIDE_PX
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
 from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ImageLimits, image_size
+from mapless_server.images import ANY_SIZE, image_size
 from mapless_tools.bags.options import BagOptions
 from mapless_tools.dataset import Dataset, Frame, Refusal, image_file, legal_id, named
 
@@ -82,8 +82,6 @@ class ReadOptions:
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 """Camera axes x right, y up, z back to x right, y down, z forward; its own inverse."""
-ANY_SIZE = ImageLimits(max_bytes=2**40, max_pixels=2**40, min_side_px=1, max_side_px=2**30)
-"""Headers are read for the sizes alone; the server has limits of its own."""
 _HEAD_BYTES = 2**16
 
 
