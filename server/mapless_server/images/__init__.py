@@ -5,5 +5,3 @@ Imports only `mapless_server.errors`. Begin with `decode`.
 
 from .decode import ANY_SIZE, ImageLimits, decode_image, image_size
 from .masks import check_mask, decode_mask
-
-__all__ = ["ANY_SIZE", "ImageLimits", "check_mask", "decode_image", "decode_mask", "image_size"]

@@ -7,5 +7,3 @@ May import observability and everything below it. Begin with `guard.CallGuard`, 
 from .call import Call
 from .guard import CLIENT_ID_KEY, Authenticate, CallGuard
 from .sending import REQUEST_ID_KEY, to_status
-
-__all__ = ["CLIENT_ID_KEY", "REQUEST_ID_KEY", "Authenticate", "Call", "CallGuard", "to_status"]

@@ -9,22 +9,3 @@ from .audit.verdict import AuditVerdict, Coverage, CoverageVerdict, ReferenceAud
 from .retrieval.index import GlobalDescriptor, Vector
 from .retrieval.narrowing import ANYWHERE, Cone, Narrowing, Sphere
 from .retrieval.ranking import Choice, RankedReference, RankOptions, Selection, rank_references
-
-__all__ = [
-    "ANYWHERE",
-    "AuditVerdict",
-    "Choice",
-    "Cone",
-    "Coverage",
-    "CoverageVerdict",
-    "GlobalDescriptor",
-    "Narrowing",
-    "RankOptions",
-    "RankedReference",
-    "ReferenceAudit",
-    "Selection",
-    "Sphere",
-    "Vector",
-    "Viewpoint",
-    "rank_references",
-]

@@ -28,31 +28,3 @@ from .binding import assess_binding, is_loopback
 from .rate import RateLimiter
 from .reloading import SecurityError
 from .tokens import create_token, read_tokens, revoke_token, written_secret
-
-__all__ = [
-    "DEFAULT_TENANT",
-    "ENDLESS_METHODS",
-    "KEY_SEPARATOR",
-    "METHOD_ROLES",
-    "OPEN_METHODS",
-    "Authenticator",
-    "Principal",
-    "RateLimiter",
-    "Role",
-    "SceneKey",
-    "SecurityError",
-    "Tokens",
-    "assess_binding",
-    "certificate_name",
-    "check_tenant",
-    "create_token",
-    "end_of_keys",
-    "is_loopback",
-    "key_of",
-    "read_tokens",
-    "revoke_token",
-    "scene_id_of",
-    "sha256_of",
-    "tenant_of",
-    "written_secret",
-]

@@ -24,21 +24,3 @@ from .records import (
 )
 from .rows import time_us
 from .store import Store
-
-__all__ = [
-    "ContradictingDown",
-    "DatumWithoutMetres",
-    "DescribedReference",
-    "IndexedReference",
-    "LruCache",
-    "NewReference",
-    "ReferenceRecord",
-    "SceneAttributes",
-    "SceneChanges",
-    "SceneRecord",
-    "SelfCalibration",
-    "Store",
-    "StoreError",
-    "calibration_kind",
-    "time_us",
-]

@@ -11,15 +11,3 @@ from .catalogue import (
     named,
 )
 from .folder import find_weights
-
-__all__ = [
-    "CATALOGUE",
-    "CheckpointError",
-    "FetchError",
-    "FolderError",
-    "UnknownWeights",
-    "WeightsError",
-    "WeightsMissing",
-    "find_weights",
-    "named",
-]
