@@ -11,7 +11,6 @@ from itertools import chain, zip_longest
 import numpy as np
 from scipy.spatial import KDTree
 
-from mapless.geometry import rotation_angle_deg
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance, viewpoint_gap
 from mapless_server.method.features.extractors import FeatureExtractor
@@ -19,6 +18,7 @@ from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import refine
 from mapless_server.method.options import LocalizeOptions, StageContext
+from mapless_server.method.pairs.readings.repeats import pose_difference
 from mapless_server.method.pipeline import Pipeline, prepare, reconstruct
 from mapless_server.method.rejection import Rejection
 from mapless_server.security import SceneKey
@@ -184,10 +184,8 @@ def left_out(subject: PosedView, answer: Answer) -> LeftOut | None:
     outcome, support = answer.outcome, answer.support
     if not isinstance(outcome, Localization) or outcome.covariance is None or not isinstance(support, PosedSupport):
         return None
-    found, given = outcome.world_from_camera, subject.world_from_camera
     return LeftOut(
-        float(np.linalg.norm(found.translation - given.translation)),
-        rotation_angle_deg(found.rotation.T @ given.rotation),
+        *pose_difference(outcome.world_from_camera, subject.world_from_camera),
         accuracy_from_covariance(outcome.covariance),
         outcome.trust or 0.0,
         *viewpoint_gap(support),

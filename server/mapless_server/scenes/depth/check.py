@@ -19,9 +19,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless.geometry import Array, RigidTransform
 from mapless_server.method.features.views import KeptDepth, PosedView, ReconstructedView, Reconstruction, map_cells
 from mapless_server.method.pairs.correspond import Correspondences
+from mapless_server.method.pairs.readings.repeats import pose_difference
 from mapless_server.method.structure.model import MetricScale, Structure
 from mapless_server.method.structure.structure import StructureOptions, triangulated_structure
 
@@ -62,8 +63,7 @@ def checked_depths(
     """
     options = StructureOptions(min_parallax_deg=MIN_PARALLAX_DEG)
     structure = triangulated_structure(references, correspondences, options)
-    off = scale.world_from_query.translation - world_from_query.translation
-    off_deg = rotation_angle_deg(scale.world_from_query.rotation.T @ world_from_query.rotation)
+    off, off_deg = pose_difference(scale.world_from_query, world_from_query)
     depths = [
         _scaled(view, scale.metres_per_unit, reference, _seen(structure, index), structure)
         for index, (view, reference) in enumerate(zip(reconstruction.references, references, strict=True))
@@ -71,7 +71,7 @@ def checked_depths(
     known = [float(np.nanmedian(it.depth)) for it in depths if it is not None]
     if not known:
         return [None] * len(references)
-    is_found = np.linalg.norm(off) <= MAX_OFF * np.median(known) and off_deg <= MAX_OFF_DEG
+    is_found = off <= MAX_OFF * np.median(known) and off_deg <= MAX_OFF_DEG
     if not is_found:  # also if it is NaN
         return [None] * len(references)
     return [_confirmed(index, depths, references) for index in range(len(references))]
