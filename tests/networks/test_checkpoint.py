@@ -184,8 +184,8 @@ def test_files_of_other_formats_are_refused_unopened(tensors: Tensors, file: Pat
 def test_the_official_file_has_the_size_of_its_tensors(name: str) -> None:
     """The header of a float32 file, as the library writes it, and its data, to the byte.
 
-    Pi3X's holds, besides ours, a second encoder for depths, of two channels; MapAnything's, as metadata, the other
-    names of tensors that its modules share.
+    Those of Pi3X and MapAnything hold, besides ours, encoders of depths; MapAnything's, as metadata, the other names of
+    tensors that its modules share.
     """
     (weights,) = [weights for weights in CATALOGUE if weights.name == name]
     module, class_name = weights.network.split(":")
@@ -197,6 +197,12 @@ def test_the_official_file_has_the_size_of_its_tensors(name: str) -> None:
         shapes |= {"depth_encoder.patch_embed.proj.weight": [1024, 2, 14, 14], "depth_emb": [1, 1, 1024]}
     header: dict[str, Any] = {}
     if name == "mapanything":
+        for ours, theirs in (
+            ("ray_dirs_encoder.", "depth_encoder."),
+            ("cam_trans_scale_encoder.", "depth_scale_encoder."),
+        ):
+            shapes |= {key.replace(ours, theirs): shape for key, shape in shapes.items() if key.startswith(ours)}
+        shapes["depth_encoder.conv_in.weight"] = [588, 14 * 14, 3, 3]
         header["__metadata__"] = {alias: canonical_name(alias) for alias in mapanything_aliases(shapes)}
     end = 0
     for key, shape in sorted(shapes.items()):
