@@ -7,4 +7,5 @@ def __getattr__(name: str) -> str:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib.metadata import version
 
-    return globals().setdefault(name, version("mapless"))
+    found = globals()[name] = version("mapless")
+    return found
