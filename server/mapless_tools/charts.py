@@ -40,7 +40,7 @@ def new_axes(title: str, x_label: str, y_label: str) -> Axes:
 def prepared(axes: Axes, title: str, x_label: str, y_label: str) -> Axes:
     """Prepares axes: titles, a grid, and curves that are distinguishable without colour, too."""
     with rc_context(_STYLE):
-        axes.set_title(title, fontweight="bold", loc="left", fontsize=10)
+        axes.set_title(title, fontweight="bold", loc="left", fontsize=10, parse_math=False)  # a name may have a $
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
         axes.grid(alpha=0.25)

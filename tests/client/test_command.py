@@ -17,11 +17,13 @@ import pytest
 from google.protobuf import json_format
 from support.commands import run_client
 from support.servers import BLACK, CAMERA, PHOTO, RunningServer, pose
+from typer.testing import CliRunner
 
 import mapless
 from mapless import AlreadyExists, Camera, Client, NewReference, wire
 from mapless.cli.arguments import make_parser
 from mapless.cli.output import plain
+from mapless_tools.cli.app import app
 
 HEALTHY = dict.fromkeys(("server", "LocalizationService", "ReferenceService"), "SERVING")
 CLIENT = Path(mapless.__file__).parents[1]
@@ -377,13 +379,29 @@ class TestOnATerminal:
         assert report.endswith("\r\x1b[K2 of 2 localized\n")
 
 
-def test_drawings_are_one_page_each_and_debug_goes_by_name(run: Run, scene: str, folder: Path, tmp_path: Path) -> None:
-    pages = tmp_path / "pages"
-    code, printed, report = run("localize", scene, folder, "--draw", pages)
-    assert (code, report) == (0, f"2 of 2 localized\npages to look at are in {pages}\n")
-    assert all(answer["debug"] is None for answer in lines_of(printed))
+def test_answers_with_debug_are_drawn_a_page_each(
+    run: Run, scene: str, folder: Path, server: RunningServer, tmp_path: Path
+) -> None:
+    answers, pages = tmp_path / "answers.jsonl", tmp_path / "pages"
+    assert run("localize", scene, folder, "--debug", "--output", answers)[0] == 0
+    draw = ["draw", str(answers), str(folder), "--output", str(pages), "--address", server.address]
+    done = CliRunner().invoke(app, draw)
+    assert (done.exit_code, done.output) == (0, f"2 pages are in {pages}\n")
     assert sorted(page.name for page in pages.iterdir()) == ["images_0.png.html", "images_2.png.html"]
-    assert "images/0.png" in (pages / "images_0.png.html").read_text()
+    page = (pages / "images_0.png.html").read_text()
+    for shown in ("images/0.png: localized", "90 of 120 matches", "<td>r0</td>", "From above"):  # with references
+        assert shown in page
+    assert "camera" not in run("localize", scene, folder / "images" / "0.png", "--camera", FOUR_NUMBERS)[1]
+
+
+@pytest.mark.parametrize("flag", [["--draw", "pages"], ["--draw=pages"], ["--draw"]])
+def test_who_asks_for_drawings_learns_the_new_command(flag: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        make_parser().parse_args(["localize", "kitchen", "query.jpg", *flag])
+    error = capsys.readouterr().err
+    assert "--draw is gone: write the answer with --debug --output answer.json" in error
+    assert "`mapless-server draw answer.json PHOTO`" in error
+    assert len(error.splitlines()) == 1
 
 
 def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:

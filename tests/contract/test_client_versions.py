@@ -19,7 +19,6 @@ PROGRAM = """
 import asyncio, importlib.util, sys
 import google.protobuf, grpc, numpy as np
 import mapless
-from mapless.report import report_html
 
 assert not [name for name in ("torch", "cv2", "scipy", "PIL") if importlib.util.find_spec(name)]
 address, photo = sys.argv[1:]
@@ -33,7 +32,6 @@ def check(answer):
     assert isinstance(answer, mapless.LocalizationResult), answer
     assert answer.world_from_camera.translation.tolist() == [0.0, 2.0, -1.0]
     assert answer.covariance.shape == (6, 6)
-    assert "<html" in report_html(answer, open(photo, "rb").read(), camera)
 
 
 with mapless.Client(address) as client:
@@ -104,8 +102,7 @@ def test_the_client_runs_at_both_ends_of_its_versions(end: str, wheel: Path, tmp
 
     with serving(tmp_path / "data") as server:
         protobuf, grpcio, _ = run("-c", PROGRAM, server.address, str(photo)).split()
-        localize = ("localize", "asyncio", str(photo), "--camera", "80,81,47.5,31.5", "--draw", str(tmp_path / "pages"))
+        localize = ("localize", "asyncio", str(photo), "--camera", "80,81,47.5,31.5", "--debug")
         assert '"pose_stage": "REFINED"' in run("-m", "mapless", "--address", server.address, *localize)
-    assert (tmp_path / "pages" / "photo.png.html").stat().st_size > 5000
     if end == "floor":
         assert {f"protobuf=={protobuf}", f"grpcio=={grpcio}"} <= {*wanted}

@@ -21,7 +21,7 @@ from mapless_server.method.features.matching import mutual_matches
 from mapless_tools.child import ChildServer
 from mapless_tools.demo import Photograph, Place, depth_map_m, room, run
 from mapless_tools.demo.photographs import ROOM
-from mapless_tools.demo.picture import Shot
+from mapless_tools.matches import read_picture
 
 CAMERA = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
 
@@ -54,7 +54,7 @@ def test_photographs_show_the_same_points_in_place(place: Place) -> None:
     """Half a pixel would be seen: keypoints of references, lifted by their depths, beside their matches in queries."""
     offsets = []
     queries, references = place.queries[:2], place.references[2::8]
-    views = {it.name: SiftExtractor().extract(Shot.of(it, 960).image, it.camera) for it in (*queries, *references)}
+    views = {it.name: SiftExtractor().extract(read_picture(it.data, 960), it.camera) for it in (*queries, *references)}
     for query, reference in itertools.product(queries, references):
         pairs = mutual_matches(views[query.name].features, views[reference.name].features, 0.7)
         keypoints = [views[it.name].features.keypoints[pairs[:, i]] for i, it in enumerate((query, reference))]
@@ -75,9 +75,9 @@ def test_the_script_renders_the_photographs_that_are_here(place: Place) -> None:
     from research.rendered_room.photographs import photograph, walk
 
     station = walk(0, 16)[5]
-    expected = Shot.of(place.references[5], 960)
+    expected = place.references[5]
     np.testing.assert_allclose(station.world_from_camera.matrix(), expected.world_from_camera.matrix(), atol=1e-12)
-    difference = photograph(lit_room(0), station, 0).astype(float) - expected.image
+    difference = photograph(lit_room(0), station, 0).astype(float) - read_picture(expected.data, 960)
     assert np.sqrt(np.mean(difference**2)) < 6  # the compression of a noisy picture
 
 

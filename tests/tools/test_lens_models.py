@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 from support.lenses import Division, add_planted_lenses
-from support.planted_answers import diagnostics
+from support.planted_answers import localized
 from support.scenes import CAMERA
 
 from mapless import wire
 from mapless.cameras import read_cameras
 from mapless.geometry import Camera, RigidTransform
 from mapless.lenses import LENS_MODELS
-from mapless.report.sections import provenance_section
 from mapless.v1 import geometry_pb2 as pb
 from mapless_server.method.features.views import undistort_pixels
 from mapless_server.store.codec import decode_geometry, encode_geometry, sha256_for
+from mapless_tools.draw import answer_page
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
 from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
@@ -70,9 +70,9 @@ def undistorted(camera: Camera, folder: Path) -> Camera:
 
 
 def reported(camera: Camera, folder: Path) -> Camera:
-    """The camera, if the report names its lens."""
-    section = provenance_section(diagnostics(), camera)
-    return camera if "lens distortion" in section and "coefficient -0.25" in section else CAMERA
+    """The camera, if the page of an answer names its lens."""
+    page = answer_page("a", localized(debug=None), b"", camera)
+    return camera if "lens distortion" in page and "coefficient -0.25" in page else CAMERA
 
 
 PLACES = [sent, stored, exported, listed, undistorted]

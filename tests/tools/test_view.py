@@ -19,8 +19,9 @@ from mapless.answers import Accuracy, Hint, Hypothesis, LocalizationResult, Reje
 from mapless.diagnostics import Debug, Diagnostics, ReferenceUse
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.cli.app import app
+from mapless_tools.matches import read_picture
 from mapless_tools.view.drawing import ellipsoid
-from mapless_tools.view.feed import Query, colours_at, read_picture
+from mapless_tools.view.feed import Query, colours_at
 from mapless_tools.view.scenery import lay_out, spread_out
 
 CAMERA = Camera(1800, 1350, 1500.0, 1500.0, 899.5, 674.5)

@@ -47,6 +47,11 @@ _COUNT_DEFAULT = "(default: the server's)"
 
 _MASK = "PNG of the photograph's size, 0 where it shows nothing of the place"
 
+_DRAWING = (
+    "write the answer with --debug --output answer.json, and draw it with `mapless-server draw answer.json PHOTO` of "
+    f"the tools ({how_to_install('tools')})"
+)
+
 _COMMON_DEFAULTS: dict[str, Any] = {
     "json": None,
     "timeout": 30.0,
@@ -89,6 +94,17 @@ class _Parser(argparse.ArgumentParser):
         nearest = difflib.get_close_matches(given, list(known), 1)
         help_text = f"; did you mean {nearest[0]!r}?" if nearest else f"\n`{self.prog} --help` shows what it takes"
         self.exit(2, f"{self.prog}: error: {message}{help_text}\n")
+
+
+class _Gone(argparse.Action):
+    """A flag of an earlier version: says what to use instead."""
+
+    def __init__(self, instead: str, **options: Any) -> None:
+        super().__init__(**options)
+        self._instead = instead
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        parser.exit(2, f"{parser.prog}: error: {self.option_strings[0]} is gone: {self._instead}\n")
 
 
 class _Command(_Parser):
@@ -350,8 +366,11 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.add_argument("--parallel", type=int, default=2, help="concurrent calls for a folder (default: %(default)s)")
     shown = command.add_argument_group("output")
     shown.add_argument("--output", type=Path, metavar="FILE", help="write JSON to a file; of a folder one line each")
-    shown.add_argument("--debug", action="store_true", help="include the matches that support the answer in the JSON")
-    shown.add_argument("--draw", type=Path, metavar="FOLDER", help="write an HTML report for each photograph")
+    shown.add_argument(
+        "--debug", action="store_true",
+        help="include the camera and the matches in the JSON, of which `mapless-server draw` makes pages to look at",
+    )  # fmt: skip
+    shown.add_argument("--draw", action=_Gone, nargs="?", help=argparse.SUPPRESS, instead=_DRAWING)
     command.set_defaults(run=localize.run)
 
 

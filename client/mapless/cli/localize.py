@@ -16,19 +16,16 @@ import numpy as np
 from ..answers import LocalizationResult, Rejected
 from ..cameras import FOLDER_FILE, read_camera, read_cameras, read_masks, read_pose
 from ..client import Client
-from ..errors import InvalidArgument, MaplessError, NotFound
+from ..errors import InvalidArgument, MaplessError
 from ..geometry import Camera
 from ..masks import find_mask, mask_name
 from ..priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
-from ..report import write_report
 from ..requests import ImageSource, IntrinsicsUncertainty
-from ..results import Reference
 from . import output
 from .folder import EXIT_REJECTED, Concurrency, LimitedClient, Outcome, Tally
 
 ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".webp"})
 _FIELDS_OF_PHOTOS = ("image", "intrinsics", "mask")
-_DRAWN_REFERENCES, _SHOWN_REFERENCES = 16, 4
 
 
 @dataclass(frozen=True)
@@ -47,10 +44,6 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
         raise ValueError("--rerank needs --reference: it chooses among the references given")
     if arguments.parallel < 1:
         raise ValueError(f"--parallel must be at least 1, is {arguments.parallel}")
-    if arguments.draw is not None:
-        if arguments.draw.is_file():
-            raise ValueError(f"--draw names a folder for the pages, but {arguments.draw} is a file")
-        arguments.draw.mkdir(parents=True, exist_ok=True)
     if not arguments.photo.is_dir():
         return _one(client, arguments)
     if arguments.progressive:
@@ -69,10 +62,10 @@ def _one(client: Client, arguments: argparse.Namespace) -> int:
     with _opened(arguments.output) as file:
         for answer in itertools.chain([first], answers):
             if arguments.output or output.is_json(arguments):
-                print(json.dumps(output.plain(_printed(answer, arguments)), indent=indent), file=file, flush=True)
+                print(json.dumps(_json(photo, answer, arguments), indent=indent), file=file, flush=True)
             else:
                 print(answer, file=file, flush=True)
-    _print_paths(arguments)
+    _print_path(arguments)
     return EXIT_REJECTED if isinstance(answer, Rejected) else 0
 
 
@@ -84,8 +77,7 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
     ]
     if arguments.mask is not None and not any(it.mask for it in photos):
         raise ValueError(f"{arguments.mask} has a mask of none of the photographs: {mask_name(photos[0].name)} or so")
-    names = [photo.name for photo in photos]
-    width = max(map(len, names))
+    width = max(len(photo.name) for photo in photos)
     as_json = bool(arguments.output) or output.is_json(arguments)
     tally = Tally(len(photos))
     try:
@@ -93,23 +85,21 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
             if not as_json:
                 print(output.heading(width), file=file)
             tally.draw()
-            for name, outcome in zip(names, outcomes, strict=True):
+            for photo, outcome in zip(photos, outcomes, strict=True):
                 tally.clear()
-                print(_row(name, width, outcome, as_json, arguments), file=file, flush=True)
+                print(_row(photo, width, outcome, as_json, arguments), file=file, flush=True)
                 tally.count(outcome)
     finally:
         tally.clear()
         if tally.done:  # also where the command ends early: by Ctrl-C, or because the server is gone
             print(tally.summary(), file=sys.stderr)
-            _print_paths(arguments)
+            _print_path(arguments)
     return tally.exit_code
 
 
-def _print_paths(arguments: argparse.Namespace) -> None:
+def _print_path(arguments: argparse.Namespace) -> None:
     if arguments.output is not None:
         print(f"answers are in {arguments.output}", file=sys.stderr)
-    if arguments.draw is not None:
-        print(f"pages to look at are in {arguments.draw}", file=sys.stderr)
 
 
 def photos_of(folder: Path, camera: str | None) -> list[Photo]:
@@ -224,47 +214,32 @@ def _answers(
         "coverage": arguments.coverage,
         "axes": arguments.axes,
         "include_imprecise_pose": arguments.include_imprecise_pose,
-        "include_debug": arguments.debug or arguments.draw is not None,
+        "include_debug": arguments.debug,
     }
     photograph = image, photo.camera, arguments.scene, arguments.reference
     if arguments.progressive:
-        for answer in client.localize_progressively(*photograph, **options):
-            yield answer
+        yield from client.localize_progressively(*photograph, **options)
     else:
-        answer = client.localize(*photograph, **options)
-        yield answer
-    if arguments.draw is not None:
-        page = arguments.draw / f"{photo.name.replace('/', '_')}.html"
-        shown = _references(client, arguments.scene, answer)
-        write_report(answer, image, photo.camera, page, references=shown, title=photo.name)
+        yield client.localize(*photograph, **options)
 
 
-def _references(client: Client, scene: str, answer: LocalizationResult | Rejected) -> list[Reference]:
-    """Fetches the references with matches, the hint's first, the best with their photographs; skips deleted ones."""
-    uses = sorted(answer.diagnostics.references, key=lambda use: (-use.inlier_count, -use.match_count))
-    names = [use.name for use in uses if use.match_count > 0]
-    hint = answer.hint if isinstance(answer, Rejected) else None
-    if hint is not None and hint.best_reference:
-        names = [hint.best_reference, *(name for name in names if name != hint.best_reference)]
-    found = []
-    for rank, name in enumerate(names[:_DRAWN_REFERENCES]):
-        with contextlib.suppress(NotFound):
-            found.append(client.get_reference(scene, name, include_image=rank < _SHOWN_REFERENCES))
-    return found
-
-
-def _row(name: str, width: int, outcome: Outcome, as_json: bool, arguments: argparse.Namespace) -> str:
+def _row(photo: Photo, width: int, outcome: Outcome, as_json: bool, arguments: argparse.Namespace) -> str:
     if isinstance(outcome, MaplessError):
         fields = {"code": outcome.code, "reason": outcome.reason, "message": outcome.message, "field": outcome.field}
-        return json.dumps({"photo": name, "error": fields}) if as_json else f"{name:{width}}  failed: {outcome}"
+        return (
+            json.dumps({"photo": photo.name, "error": fields})
+            if as_json
+            else f"{photo.name:{width}}  failed: {outcome}"
+        )
     if as_json:
-        return json.dumps({"photo": name} | output.plain(_printed(outcome, arguments)))
-    return output.line(f"{name:{width}}", outcome)
+        return json.dumps({"photo": photo.name} | _json(photo, outcome, arguments))
+    return output.line(f"{photo.name:{width}}", outcome)
 
 
-def _printed(answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> Any:
-    """The form of an answer that is printed: with its matches only if --debug was given."""
-    return answer if arguments.debug else replace(answer, debug=None)
+def _json(photo: Photo, answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> dict[str, Any]:
+    """An answer as JSON values; with --debug, beside what `mapless-server draw` needs to draw it."""
+    drawn = {"photo": photo.name, "camera": output.plain(photo.camera)} if arguments.debug else {}
+    return drawn | output.plain(answer)
 
 
 def limits(arguments: argparse.Namespace) -> Priors:

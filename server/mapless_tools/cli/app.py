@@ -11,6 +11,7 @@ from mapless_command.installation import how_to_install
 from mapless_server import __version__
 from mapless_server.extras import missing_package
 from mapless_server.serve.command import fail, serve_command
+from mapless_tools.draw.command import draw_command
 from mapless_tools.evaluate.cli import evaluate_command
 from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
@@ -80,6 +81,7 @@ app.add_typer(weights_app, name="weights")
 _add_tool("import", import_command, cls=ImportCommand)
 _add_tool("export", export_command)
 _add_tool("audit", audit_command)
+_add_tool("draw", draw_command)
 _add_tool("evaluate", evaluate_command)
 _add_tool("replay", replay_command)
 _add_tool("replay-bag", replay_bag_command)

@@ -3,7 +3,7 @@
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from rich.table import Table
 from mapless import Client, ConnectOptions, LocalizationResult, Rejected
 from mapless_tools.child import ATTEMPTS, child_server
 from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.matches import Picture
 
 from . import picture
 from .photographs import Photograph, Place, place_of
@@ -130,30 +131,30 @@ def summarize(console: Console, place: Place, outcomes: Sequence[Outcome]) -> bo
 def write_pictures(place: Place, outcomes: Sequence[Outcome], output: Path) -> list[Path]:
     """Writes one picture for each query, and first a sheet of all."""
     output.mkdir(parents=True, exist_ok=True)
-    shots = {photo.name: picture.Shot.of(photo, DRAWN_PX) for photo in place.references}
-    pictures = [_picture(place, outcome, shots) for outcome in outcomes]
+    posed = {photo.name: picture.Posed.of(photo, DRAWN_PX) for photo in place.references}
+    pictures = [_picture(place, outcome, posed) for outcome in outcomes]
     paths = [output / "all.png", *(output / f"{outcome.query.name}.png" for outcome in outcomes)]
     for path, image in zip(paths, [picture.contact_sheet(pictures), *pictures], strict=True):
         path.write_bytes(picture.png(image))
     return paths
 
 
-def _picture(place: Place, outcome: Outcome, shots: Mapping[str, picture.Shot]) -> picture.Canvas:
+def _picture(place: Place, outcome: Outcome, posed: Mapping[str, picture.Posed]) -> Picture:
     answer, references = outcome.answer, outcome.answer.diagnostics.references
     best = max(range(len(references)), key=lambda i: references[i].inlier_count, default=None)
-    nearest = next(iter(shots.values())) if best is None else shots[references[best].name.rpartition("/")[2]]
-    query = picture.Shot.of(outcome.query, DRAWN_PX)
+    nearest = next(iter(posed.values())) if best is None else posed[references[best].name.rpartition("/")[2]]
+    query = picture.Posed.of(outcome.query, DRAWN_PX)
     found = None
     if isinstance(answer, LocalizationResult):
         found = answer.world_from_camera
         if debug := answer.debug:
-            query = query.with_points(
-                debug.x_in_world[debug.is_inlier], debug.query_px[debug.is_inlier], outcome.query.camera
-            )
+            pixels = query.shot.pixels_of(debug.query_px[debug.is_inlier], outcome.query.camera)
+            query = replace(query, points=debug.x_in_world[debug.is_inlier], keypoints=pixels)
             shown = debug.is_inlier & (debug.reference == best)
             camera = next(it.camera for it in place.references if it.name == nearest.name)
-            nearest = nearest.with_points(debug.x_in_world[shown], debug.reference_px[shown], camera)
-    return picture.draw(query, found, nearest, [*shots.values()], place.outline, _caption(outcome, place.metric))
+            pixels = nearest.shot.pixels_of(debug.reference_px[shown], camera)
+            nearest = replace(nearest, points=debug.x_in_world[shown], keypoints=pixels)
+    return picture.draw(query, found, nearest, [*posed.values()], place.outline, _caption(outcome, place.metric))
 
 
 def _caption(outcome: Outcome, metric: bool) -> list[str]:

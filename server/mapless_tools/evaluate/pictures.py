@@ -1,13 +1,11 @@
 """Pictures of the worst queries: the photograph beside its best reference, with their matches.
 
-A match is green if it fits the true poses, else red. Only red ones: the matches are wrong. Green ones and a wrong pose:
-the error is after matching. None: the two photographs do not overlap.
+A match is green if it fits the true poses, else orange. Only orange ones: the matches are wrong. Green ones and a wrong
+pose: the error is after matching. None: the two photographs do not overlap.
 """
 
-import base64
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,19 +14,16 @@ from mapless_server.images import decode_image
 from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.views import View
 from mapless_tools.dataset import Frame
+from mapless_tools.matches import Shot, data_uri, side_by_side
 from mapless_tools.progress import Progress
 
 from .metrics import QueryResult
 from .references import Matcher
 from .suite import Run, Suite
 
-HEIGHT_PX, GAP_PX = 260, 6
+HEIGHT_PX, MAX_SIDE_PX = 260, 640
 EPIPOLAR_PX = 4.0
 """A match farther from the epipolar line of the true poses is wrong; in pixels of the processed query."""
-MAX_DRAWN = 60
-QUALITY = 72
-Picture = NDArray[np.uint8]
-GREEN, RED = (40, 200, 90), (230, 60, 50)
 
 
 @dataclass(frozen=True)
@@ -86,12 +81,13 @@ def worst_of(run: Run, count: int, matcher: Matcher) -> list[WorstQuery]:
         beside = result.best_reference or next(iter(result.references), "")
         query = _Shown.of(frames[result.name], matcher)
         if not beside:
-            worst.append(WorstQuery(run, result, data_uri(query.image), "", 0, 0))
+            worst.append(WorstQuery(run, result, data_uri(query.shot.image), "", 0, 0))
             continue
         reference = _Shown.of(frames[beside], matcher)
         matches = mutual_matches(query.view.features, reference.view.features, matcher.ratio)
         fits = fit_true_poses(query.frame, reference.frame, query.view, reference.view, matches)
-        picture = _side_by_side(query, reference, matches, fits)
+        ends = query.keypoints[matches[:, 0]], reference.keypoints[matches[:, 1]]
+        picture = side_by_side(query.shot, reference.shot, *ends, fits, HEIGHT_PX)
         worst.append(WorstQuery(run, result, data_uri(picture), beside, len(matches), int(fits.sum())))
     return worst
 
@@ -109,48 +105,19 @@ def fit_true_poses(
     return np.asarray(distance * query_view.camera.focal_x_px <= EPIPOLAR_PX)
 
 
-def data_uri(picture: Picture) -> str:
-    """The picture (H, W, 3) RGB as a JPEG in a data URI."""
-    quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-    encoded = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), quality)[1]
-    return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
-
-
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """A photograph, reduced for the page, with its features.
-
-    Keypoints (N, 2) in pixels of `image`, distorted as it is.
-    """
+    """A photograph, reduced for the page, with its features, and their keypoints (N, 2) in its pixels."""
 
     frame: Frame
     view: View
-    image: Picture
+    shot: Shot
     keypoints: Array
 
     @staticmethod
     def of(frame: Frame, matcher: Matcher) -> "_Shown":
-        image = decode_image(frame.image_path.read_bytes(), matcher.limits)
-        view = matcher.extractor.extract(image, frame.camera, frame.read_ignored())
-        scale = HEIGHT_PX / image.shape[0]
-        size = (round(image.shape[1] * scale), HEIGHT_PX)
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        data = frame.image_path.read_bytes()
+        view = matcher.extractor.extract(decode_image(data, matcher.limits), frame.camera, frame.read_ignored())
         pixels = frame.camera.project(view.camera.rays(view.features.keypoints))
-        return _Shown(frame, view, np.asarray(small, np.uint8), pixels * scale)
-
-
-def _side_by_side(query: _Shown, reference: _Shown, matches: NDArray[np.int32], fits: NDArray[np.bool_]) -> Picture:
-    gap: Picture = np.full((HEIGHT_PX, GAP_PX, 3), 128, np.uint8)
-    canvas = np.ascontiguousarray(np.concatenate([query.image, gap, reference.image], axis=1))
-    offset = np.array([query.image.shape[1] + GAP_PX, 0])
-    for i in np.linspace(0, len(matches) - 1, min(len(matches), MAX_DRAWN)).round().astype(int).tolist():
-        a, b = query.keypoints[matches[i, 0]], reference.keypoints[matches[i, 1]] + offset
-        colour = GREEN if fits[i] else RED
-        cv2.line(canvas, _pixel(a), _pixel(b), colour, 1, cv2.LINE_AA)
-        for end in (a, b):
-            cv2.circle(canvas, _pixel(end), 2, colour, -1, cv2.LINE_AA)
-    return canvas
-
-
-def _pixel(place: Array) -> tuple[int, int]:
-    return round(float(place[0])), round(float(place[1]))
+        shot = Shot.of(data, frame.camera, MAX_SIDE_PX)
+        return _Shown(frame, view, shot, shot.pixels_of(pixels, frame.camera))

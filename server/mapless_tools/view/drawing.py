@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from mapless.answers import LocalizationResult
 from mapless.geometry import Array, Camera, RigidTransform
+from mapless_tools.matches import GOOD, WRONG, Picture
 
-from .feed import Picture
 from .scenery import Scenery
 
 if TYPE_CHECKING:
@@ -68,10 +68,13 @@ REFERENCE, OTHER, QUERY, SELECTED, DOUBT = (
 )
 """Colours of references, of those drawn as dots, of queries, of the selected one, and of poses that contradict each
 other."""
-INLIER, OUTLIER = (46, 230, 166), (255, 107, 43)
-"""Colours of matches that agree with the pose, and of those that do not."""
 MAX_RAYS = 90
 """Lines from a query to its points; more hide what they lead to."""
+
+
+def _rgb(colour: str) -> Colour:
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
 
 
 class Drawing:
@@ -154,8 +157,8 @@ class Drawing:
         points, right = answer.debug.x_in_world - self._scenery.origin, answer.debug.is_inlier
         drawn = []
         for kind, rows, colour, count in (
-            ("right", right, INLIER, MAX_RAYS),
-            ("wrong", ~right, OUTLIER, MAX_RAYS // 4),
+            ("right", right, _rgb(GOOD), MAX_RAYS),
+            ("wrong", ~right, _rgb(WRONG), MAX_RAYS // 4),
         ):
             lines = rays(centre, points[rows], count, longest_m)
             if len(lines):

@@ -7,7 +7,6 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import grpc
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from mapless.names import scene_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.wire import FieldError
-from mapless_server.images import ImageLimits, decode_image
+from mapless_tools.matches import Picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,19 +54,6 @@ def _length(metres: float) -> str:
 
 
 THUMBNAIL_PX = 160
-_LIMITS = ImageLimits(max_bytes=1 << 30, max_pixels=200_000_000)
-"""The server has checked the photograph; its limits may be higher than its defaults."""
-Picture = NDArray[np.uint8]
-
-
-def read_picture(image: bytes, max_side_px: int) -> Picture:
-    """Reads a photograph (H, W, 3) RGB and limits its longer side; InvalidArgument if it cannot be read."""
-    pixels = decode_image(image, _LIMITS)
-    scale = max_side_px / max(pixels.shape[:2])
-    if scale >= 1:
-        return pixels
-    size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def colours_at(picture: Picture, camera: Camera, pixels: Array) -> NDArray[np.uint8]:

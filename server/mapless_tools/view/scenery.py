@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from mapless import Reference, Scene
 from mapless.geometry import Array, RigidTransform
+from mapless_tools.plan import down_of
 
 _TURN_WEIGHT = 0.4
 """How far apart two cameras count that stand at one place and look opposite ways, in spreads of the scene."""
-_ALIKE = 0.5
-"""Least length of the mean of the cameras' downward axes to take it for down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,8 @@ def lay_out(scene: Scene, references: Sequence[Reference], max_pictured: int) ->
     origin = np.median(centres, axis=0)
     pictured = spread_out(_spots(references), max_pictured)
     extent_m = max(float(np.linalg.norm(np.quantile(centres, 0.95, axis=0) - np.quantile(centres, 0.05, axis=0))), 0.1)
-    return Scenery(tuple(references), pictured, origin, _down(scene, references), _size_m(centres[pictured]), extent_m)
+    down = down_of(scene, [it.world_from_camera for it in references])
+    return Scenery(tuple(references), pictured, origin, down, _size_m(centres[pictured]), extent_m)
 
 
 def spread_out(spots: Array, count: int) -> NDArray[np.intp]:
@@ -69,17 +69,6 @@ def _spots(references: Sequence[Reference]) -> Array:
     spread = max(float(np.linalg.norm(centres.std(axis=0))), 1e-6)
     ahead = np.stack([it.world_from_camera.rotation[:, 2] for it in references])
     return np.concatenate([(centres - np.median(centres, axis=0)) / spread, 0.5 * _TURN_WEIGHT * ahead], axis=1)
-
-
-def _down(scene: Scene, references: Sequence[Reference]) -> Array:
-    """The direction down of the scene or its datum; else the mean downward axis of the cameras."""
-    if scene.down_in_world is not None:
-        return np.asarray(scene.down_in_world, float)
-    if scene.datum is not None:
-        return np.asarray(-scene.datum.enu_from_world.matrix()[2])
-    mean = np.mean([it.world_from_camera.rotation[:, 1] for it in references], axis=0)
-    length = float(np.linalg.norm(mean))
-    return np.asarray(mean / length) if length > _ALIKE else np.array([0.0, 0.0, -1.0])
 
 
 def _size_m(centres: Array) -> float:

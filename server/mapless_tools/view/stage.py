@@ -4,7 +4,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any
 
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from mapless import Reference
 from mapless.answers import Rejected
 from mapless.geometry import Array
-from mapless.report import report_html
+from mapless_tools.draw import answer_page, best_references
+from mapless_tools.matches import Picture, read_picture
 
 from .drawing import DOUBT, OTHER, QUERY, REFERENCE, SELECTED, Drawing
-from .feed import THUMBNAIL_PX, Picture, Query, read_picture
+from .feed import THUMBNAIL_PX, Query
 from .guarded import GuardedViser
 from .scenery import Scenery
 
@@ -118,16 +119,19 @@ class Stage:
                     handle.color = SELECTED if it is shown else DOUBT if it.query.pose is None else QUERY
 
     def _open(self, shown: _Shown, client: Any) -> None:
-        """Selects a query, and shows the client's report of its answer."""
+        """Selects a query, and shows the page of its answer."""
         self._select(shown)
         if client is None:  # it was closed meanwhile
             return
         query = shown.query
-        used = {it.name for it in query.answer.diagnostics.references}
+        known = {f"scenes/{it.scene_id}/references/{it.reference_id}": it for it in self._scenery.references}
+        used = {it.name for it in query.answer.diagnostics.references} & known.keys()
+        pictured = best_references(query.answer)
         references = [
-            it for it in self._scenery.references if f"scenes/{it.scene_id}/references/{it.reference_id}" in used
+            replace(known[name], image=self._open_photo(known[name].reference_id)) if name in pictured else known[name]
+            for name in used
         ]
-        page = report_html(query.answer, query.image, query.camera, references, "", self._scenery.down)
+        page = answer_page(query.label, query.answer, query.image, query.camera, references, self._scenery.down)
         with _dialogue(client, query.label) as gui:
             gui.add_html(
                 f'<iframe sandbox srcdoc="{escape(page)}" style="width: 100%; height: 70vh; border: 0"></iframe>'

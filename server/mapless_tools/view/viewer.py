@@ -12,8 +12,9 @@ import numpy as np
 
 from mapless import Client, ConnectOptions, MaplessError, Reference
 from mapless_server.errors import InvalidArgument
+from mapless_tools.matches import read_picture
 
-from .feed import THUMBNAIL_PX, Feed, Picture, Query, colours_at, read_picture
+from .feed import THUMBNAIL_PX, Feed, Query, colours_at
 from .guarded import GuardedViser
 from .scenery import Scenery, lay_out
 from .stage import Stage
@@ -109,6 +110,6 @@ class _Background:
         debug = query.answer.debug
         if query.pose is None or debug is None or not debug.is_inlier.any():
             return
-        picture: Picture = read_picture(query.image, 4 * THUMBNAIL_PX)
+        picture = read_picture(query.image, 4 * THUMBNAIL_PX)
         good = np.flatnonzero(debug.is_inlier)
         self._stage.show_points(debug.x_in_world[good], colours_at(picture, query.camera, debug.query_px[good]))

@@ -1,0 +1,260 @@
+"""The page of an answer: it needs nothing else, runs nothing, and what it draws lies where it belongs."""
+
+import base64
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.html import Page
+from support.images import encode, textured, with_exif_orientation
+from support.planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
+from typer.testing import CliRunner
+
+from mapless.answers import Hint, Hypothesis, LocalizationResult, Rejected
+from mapless.cli.output import plain
+from mapless.geometry import Array
+from mapless.results import Reference
+from mapless_tools.charts import new_axes
+from mapless_tools.cli.app import app
+from mapless_tools.draw import answer_page, best_references
+from mapless_tools.draw.answers import read_answers
+from mapless_tools.matches import GOOD, RESIDUAL, WRONG, Shot, axes_on, draw_matches, rendered, side_by_side
+from mapless_tools.plan import basis_from_above, down_of, ellipse_in_plane
+
+PHOTO = encode(".jpg", textured(640, 480))
+
+
+def reference(name: str, image: bytes | None = PHOTO) -> Reference:
+    return Reference("hall", name, CAMERA, truth().shifted([0.5, 0, 0]), "", 9, NOW, image)
+
+
+BOTH = (reference("a"), reference("b"))
+AMBIGUOUS = rejected(
+    reason="AMBIGUOUS", hypotheses=(Hypothesis(truth(), 30, ("a",)), Hypothesis(truth(), 28, ("b",))), debug=debug()
+)
+
+
+def embedded(html: str) -> list[bytes]:
+    return [base64.b64decode(it) for it in re.findall(r"data:image/jpeg;base64,([\w+/=]+)", html)]
+
+
+def pixels(data: bytes) -> Array:
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    assert found is not None
+    return np.asarray(found, float)
+
+
+class TestPage:
+    @pytest.mark.parametrize(
+        ("answer", "references"),
+        [
+            (localized(), BOTH),
+            (localized(debug=None, covariance=None, accuracy=None, trust=None, pose_stage="COARSE"), ()),
+            (AMBIGUOUS, BOTH),
+            (rejected(hint=None, debug=debug(wrong=200), diagnostics=diagnostics(())), ()),
+        ],
+        ids=["localized", "coarse", "ambiguous", "bare"],
+    )
+    def test_it_loads_nothing_and_runs_no_scripts(
+        self, answer: LocalizationResult | Rejected, references: tuple[Reference, ...]
+    ) -> None:
+        html = answer_page("photo", answer, PHOTO, CAMERA, references)
+        page = Page(html)
+        assert not {"script", "iframe", "object", "link", "form", "base"} & set(page.tags)
+        for tag, name, value in page.attributes:
+            assert not name.startswith("on"), tag
+            if name in ("href", "src", "xlink:href"):
+                assert value.startswith(("#", "data:image/jpeg;base64,"))
+        outside = re.sub(r'data:image/\w+;base64,[\w+/=]+|xmlns(:xlink)?="[^"]*"|url\(#\w+\)', "", html)
+        assert not re.search(r"https?:|//[a-z]|url\(|@import", outside)
+        assert ("meta", "content", "default-src 'none'; img-src data:; style-src 'unsafe-inline'") in page.attributes
+
+    def test_names_and_messages_are_text_whatever_they_hold(self) -> None:
+        hostile = "\"><img src=x onerror=alert(1)><script>alert(2)</script></style>'&amp;$\\frac$"
+        uses = diagnostics((hostile, "b"))
+        answer = rejected(
+            reason=hostile,
+            message=hostile,
+            hint=Hint(hostile, hostile, hostile, f"scenes/hall/references/{hostile}"),
+            diagnostics=replace(uses, backend=hostile, stage_s={hostile: 1.0}, request_id=hostile),
+            hypotheses=(Hypothesis(truth(), 3, (hostile,)),),
+            debug=debug(),
+        )
+        page = Page(answer_page(hostile, answer, PHOTO, CAMERA, (replace(BOTH[0], reference_id=hostile), BOTH[1])))
+        assert page.tags["script"] == 0
+        assert page.tags["img"] == 4
+        assert sum("onerror=alert(1)" in words for words in page.words) >= 8
+
+    def test_it_shows_what_the_answer_says_and_its_inputs(self) -> None:
+        answer = localized(arbitrary_unit=True, diagnostics=replace(diagnostics(), captured=True))
+        words = " ".join(Page(answer_page("hall.jpg", answer, PHOTO, CAMERA, BOTH, [0, 0, -1])).words)
+        assert str(answer) in words
+        for shown in ("hall.jpg: localized", "(180)", "4.00e-04", "id-1", "radial_tangential: k1 -0.1", "x, units"):
+            assert shown in words
+        assert str(AMBIGUOUS) in " ".join(Page(answer_page("", AMBIGUOUS, PHOTO, CAMERA)).words)
+
+    def test_a_rejection_shows_what_to_point_the_camera_at(self) -> None:
+        html = answer_page("", rejected(), PHOTO, CAMERA, (reference("a", encode(".png", textured(64, 48))), BOTH[1]))
+        assert "Point the camera at this: a" in html
+        assert pixels(embedded(html)[1]).shape == (48, 64, 3)
+        hint = rejected().hint
+        assert hint is not None
+        other = rejected(hint=replace(hint, advice="CHECK_CALIBRATION"))
+        assert "It shares most with the photograph: a" in answer_page("", other, PHOTO, CAMERA, BOTH)
+        assert "What helps" not in answer_page("", rejected(hint=None), PHOTO, CAMERA, BOTH)
+
+    def test_the_best_references_come_first_after_the_hints(self) -> None:
+        used = diagnostics(("a", "b", "c", "d", "e"))
+        assert [it[-1] for it in best_references(localized(diagnostics=used))] == ["a", "b", "c"]
+        hint = replace(rejected().hint, best_reference="scenes/hall/references/e")  # type: ignore[type-var]
+        assert [it[-1] for it in best_references(rejected(diagnostics=used, hint=hint))] == ["e", "a", "b", "c"]
+
+    def test_references_without_matches_are_not_mapped(self) -> None:
+        uses = tuple(replace(use, match_count=0, inlier_count=0, similarity=0.0) for use in diagnostics().references)
+        bare = rejected(hint=None, diagnostics=replace(diagnostics(), references=uses))
+        page = answer_page("", bare, PHOTO, CAMERA, BOTH)
+        assert "From above" not in page
+        assert "feature matches" not in page
+        assert "From above" in answer_page("", rejected(), PHOTO, CAMERA, BOTH)
+
+    @pytest.mark.parametrize("orientation", [1, 6])
+    def test_photographs_lie_as_stored_without_metadata(self, orientation: int) -> None:
+        turned = with_exif_orientation(PHOTO, orientation)
+        (data,) = embedded(answer_page("", localized(debug=None), turned + b"where", CAMERA))
+        assert b"Exif" not in data
+        assert b"where" not in data
+        assert np.abs(pixels(data) - pixels(PHOTO)).mean() < 4
+
+    def test_it_can_be_mailed_however_large_photographs_are(self) -> None:
+        large = encode(".jpg", np.random.default_rng(1).integers(0, 256, (1800, 2400, 3)).astype(np.uint8))
+        html = answer_page("", localized(), large, CAMERA, [reference(name, large) for name in ("a", "b")])
+        assert len(embedded(html)) == 3
+        assert len(html) < 5e6
+
+    @pytest.mark.parametrize("image", [b"", b"<svg/>", PHOTO[:40]])
+    def test_what_is_no_photograph_is_left_out(self, image: bytes) -> None:
+        html = answer_page("", localized(), image, CAMERA)
+        assert "cannot be read" in html
+        assert "data:image" not in html
+
+
+def near(picture: Array, colour: str) -> Array:
+    """Where a picture (H, W, 3) has a colour: pixels (N, 2), x first."""
+    wanted = np.array([*bytes.fromhex(colour[1:])], float)
+    return np.argwhere(np.abs(picture - wanted).max(axis=2) < 40)[:, ::-1]
+
+
+class TestMatches:
+    def test_residuals_lead_from_observed_to_projected_pixels(self) -> None:
+        axes = axes_on(np.zeros((400, 800, 3), np.uint8))
+        seen = np.array([[100.0, 100.0], [300.0, 300.0], [600.0, 200.0]])
+        projected = seen + [[4.0, 0.0], [4.0, 0.0], [500.0, 0.0]]
+        factor = draw_matches(axes, seen, projected, np.array([True, True, False]))
+        assert factor == 1
+        draw_matches(axes, seen[:1], seen[:1] + [0.5, 0.0], np.array([True]))  # drawn longer
+        picture = rendered(axes.figure).astype(float)
+        assert picture.shape == (400, 800, 3)
+        for x, y in seen[:2]:
+            assert np.abs(near(picture, GOOD) - (x, y)).sum(axis=1).min() <= 2
+        lines = near(picture, RESIDUAL)
+        assert np.abs(lines - (304, 300)).sum(axis=1).min() <= 2
+        wrong = near(picture, WRONG)
+        assert np.abs(wrong - (600, 200)).sum(axis=1).min() <= 2
+        assert wrong[:, 0].max() <= 600 + 0.06 * 800 + 2  # its line covers nothing
+
+    def test_lines_join_the_pixels_of_two_photographs(self) -> None:
+        black = [Shot(np.zeros((h, w, 3), np.uint8), CAMERA.resized(w, h)) for h, w in ((240, 320), (480, 640))]
+        ends = np.array([[100.0, 60.0]]), np.array([[500.0, 400.0]])
+        picture = side_by_side(*black, *ends, np.array([True]), 240).astype(float)
+        drawn = near(picture, GOOD)
+        for end in ((100, 60), (320 + 12 + 250, 200)):
+            assert np.abs(drawn - end).sum(axis=1).min() <= 3
+        assert not len(near(picture, WRONG))
+
+    def test_names_are_no_formulas(self) -> None:
+        new_axes("a$b$ \\frac", "", "").figure.savefig(Path("/dev/null"), format="svg")
+
+
+class TestPlan:
+    def test_east_is_to_the_right_and_north_is_up(self) -> None:
+        np.testing.assert_allclose(basis_from_above([0.0, 0.0, -1.0]), [[1, 0, 0], [0, 1, 0]], atol=1e-12)
+        np.testing.assert_allclose(np.cross(*basis_from_above([0.0, 1.0, 0.0])), [0.0, -1.0, 0.0], atol=1e-12)
+
+    def test_gravity_is_the_cameras_y_axis_or_their_planes_normal(self) -> None:
+        np.testing.assert_allclose(down_of(None, [truth()]), truth().rotation[:, 1])
+        turned = truth().rotation @ np.diag([1.0, -1.0, -1.0])
+        poses = [truth(), replace(truth().shifted([1, 0, 0]), rotation=turned), truth().shifted([0, 1, 0])]
+        poses += [replace(truth().shifted([3, 1, 0]), rotation=turned)]
+        np.testing.assert_allclose(np.abs(down_of(None, poses)), [0, 0, 1], atol=1e-12)
+
+    def test_the_ellipse_holds_95_percent(self) -> None:
+        random = np.random.default_rng(2)
+        root = random.normal(size=(6, 6))
+        covariance = root @ root.T
+        basis = basis_from_above([0.3, -0.2, -1.0])
+        radii, turn = ellipse_in_plane(basis, covariance)
+        errors = random.multivariate_normal(np.zeros(6), covariance, 100_000)[:, :3] @ basis.T
+        along = errors @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        assert ((along / radii) ** 2).sum(axis=1).__le__(1).mean() == pytest.approx(0.95, abs=0.004)
+
+
+def written(answer: LocalizationResult | Rejected) -> str:
+    return json.dumps({"photo": "a.jpg", "camera": plain(CAMERA)} | plain(answer))
+
+
+def rounded(answer: LocalizationResult | Rejected) -> object:
+    return json.loads(json.dumps(plain(answer)), parse_float=lambda it: round(float(it), 9))
+
+
+class TestAnswers:
+    @pytest.mark.parametrize("answer", [localized(), localized(debug=None, covariance=None), rejected(), AMBIGUOUS])
+    def test_an_answer_is_read_as_it_was_written(self, answer: LocalizationResult | Rejected) -> None:
+        text = written(answer)
+        failed = json.dumps({"photo": "b.jpg", "error": {"code": "INTERNAL"}})
+        for content in (text, json.dumps(json.loads(text), indent=2), f"{failed}\n{text}\n"):
+            (found,) = read_answers(content, "f")
+            assert found.photo == "a.jpg"
+            assert rounded(found.answer) == rounded(answer)
+            assert str(found.answer) == str(answer)
+            assert found.camera == CAMERA
+
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            ("", "f is empty"),
+            ("[1]", "f: no answer with its photograph and camera"),
+            ("{}", "f: no answer with its photograph and camera"),
+            ('{"photo": "a"}\n{', "f, line 2 is not JSON"),
+            ('{"photo": "a"}', "f: the answer has no camera and no matches"),
+            ('{"photo": "a", "camera": {}}', "f: no answer as"),
+            ('{"photo": "a", "camera": 3}', "f: no answer as"),
+            (written(localized(debug=replace(debug(), error_px=np.zeros(3)))), "columns of different lengths"),
+        ],
+    )
+    def test_what_is_no_answer_is_named_with_its_line(self, content: str, message: str) -> None:
+        with pytest.raises(ValueError, match=re.escape(message)):
+            list(read_answers(content, "f"))
+
+    @pytest.mark.parametrize(
+        ("files", "arguments", "message"),
+        [
+            ({}, ("none.json", "a.jpg"), "No such file"),
+            ({"a.json": written(localized())}, ("a.json", "b.jpg"), "the answer is of a.jpg, not of b.jpg"),
+            ({"a.json": written(localized())}, ("a.json", "."), "a.jpg, of which an answer is, is not there"),
+        ],
+    )
+    def test_wrong_files_are_one_sentence(
+        self, files: dict[str, str], arguments: tuple[str, ...], message: str, tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:  # fmt: skip
+        monkeypatch.chdir(tmp_path)
+        for name, content in files.items():
+            Path(name).write_text(content)
+        done = CliRunner().invoke(app, ["draw", *arguments])
+        assert done.exit_code in (1, 2)
+        assert message in done.stderr
+        assert "Traceback" not in done.output
