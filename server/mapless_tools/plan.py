@@ -86,8 +86,8 @@ def draw_plan(
         for index, (pose, camera) in enumerate(group.cameras):
             label = "_" if index else group.label
             outline = _wedge(basis, pose, camera, group.size * _WEDGE_SHARE * extent)
-            style = {"facecolor": (group.colour, 0.3), "edgecolor": group.colour, "linestyle": "-", "linewidth": 1.2}
-            axes.fill(*outline.T, label=label, **style)
+            (wedge,) = axes.fill(*outline.T, label=label, linestyle="-", linewidth=1.2)
+            wedge.set(facecolor=(group.colour, 0.3), edgecolor=group.colour)
     margin = 1.5 * _WEDGE_SHARE * extent
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     axes.set_aspect("equal", adjustable="box")

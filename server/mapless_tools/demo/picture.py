@@ -78,8 +78,7 @@ def draw(
     figure.legend(*plan.get_legend_handles_labels(), loc=(0.885, 0.1), frameon=False, labelcolor=INK, fontsize=10)
     for i, line in enumerate(lines):
         y = STRIP - (0.06 + 0.042 * i)
-        style = {"color": DIM, "fontsize": 11.5} if i else {"color": INK, "fontsize": 17}
-        figure.text(0.015, y, line, parse_math=False, **style)
+        figure.text(0.015, y, line, parse_math=False, color=DIM if i else INK, fontsize=11.5 if i else 17)
     return rendered(figure)
 
 
@@ -99,8 +98,8 @@ def png(picture: Picture) -> bytes:
 def _show(axes: Axes, image: Picture, title: str) -> None:
     show(axes, image)
     label = {"facecolor": "black", "alpha": 0.6, "edgecolor": "none"}
-    place = {"transform": axes.transAxes, "va": "top", "parse_math": False}  # a name may have a $
-    axes.text(0.012, 0.985, title, color=INK, fontsize=11, bbox=label, **place)
+    text = axes.text(0.012, 0.985, title, transform=axes.transAxes, va="top", color=INK, fontsize=11, bbox=label)
+    text.set_parse_math(False)  # a name may have a $
 
 
 def _draw_points(axes: Axes, posed: Posed) -> str:
