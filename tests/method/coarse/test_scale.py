@@ -14,7 +14,7 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless.geometry import RigidTransform, Similarity, rotation_angle_deg, rotation_from_vector
 from mapless_server.method.coarse import scale as stages
-from mapless_server.method.coarse.scale import estimate_scale, pairs_of, trajectory_scale
+from mapless_server.method.coarse.scale import estimate_scale, trajectory_scale
 from mapless_server.method.features.views import ReconstructedView, Reconstruction
 from mapless_server.method.options import ScaleStrategy
 from mapless_server.method.pairs.correspond import Correspondences
@@ -331,19 +331,14 @@ def test_trajectory_scale_equals_a_plain_implementation() -> None:
             agree = distances[distances <= 0.10]
             rms = float(np.sqrt(np.mean((agree if len(agree) else distances) ** 2)))
             best = max(best, (len(agree), -rms, float(scale)))
-        assert trajectory_scale(predicted, known, pairs_of(7, 32)) == pytest.approx(best[2])
+        assert trajectory_scale(predicted, known) == pytest.approx(best[2])
 
 
 def test_pairs_predicted_at_one_place_give_no_scale() -> None:
     known = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     predicted = np.array([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]])
-    assert trajectory_scale(predicted, known, pairs_of(3, 32)) in (1.0, 2.0)
-    assert np.isnan(trajectory_scale(np.zeros((3, 3)), known, pairs_of(3, 32)))
-
-
-def test_trajectory_pairs_are_those_of_evenly_chosen_cameras() -> None:
-    assert [tuple(pair) for pair in pairs_of(5, 32)] == list(combinations(range(5), 2))
-    assert [tuple(pair) for pair in pairs_of(9, 3)] == [(0, 4), (0, 8), (4, 8)]
+    assert trajectory_scale(predicted, known) in (1.0, 2.0)
+    assert np.isnan(trajectory_scale(np.zeros((3, 3)), known))
 
 
 def test_ray_depths_equal_a_plain_implementation() -> None:

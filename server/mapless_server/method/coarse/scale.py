@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform, Similarity
 
@@ -40,10 +39,6 @@ MAX_DEVIATION = 0.05
 INLIER_DISTANCE_M = 0.10
 """Largest distance between the aligned and the known centre of a camera that is an inlier of a scale of stage 2, as in
 the paper."""
-
-MAX_PAIR_CAMERAS = 32
-"""Stage 2 tries every pair of so many cameras, evenly thinned. All 496 pairs of 32 replace the paper's 500 random ones,
-so that an answer is reproducible."""
 
 MIN_RADIUS_M = 0.01
 """Smallest trajectory radius of the references that determines a scale: poses are accurate to about 1 cm."""
@@ -89,7 +84,7 @@ def estimate_scale(
         ratios = triangulated_ratios(references, correspondences, depth)
         first = float(np.median(ratios)) if len(ratios) >= MIN_RATIOS else math.nan
     if strategy is not ScaleStrategy.TRIANGULATION:
-        second = trajectory_scale(centres @ rotation.T, centres_world, pairs_of(count, MAX_PAIR_CAMERAS))
+        second = trajectory_scale(centres @ rotation.T, centres_world)
     of_first, of_second = (trajectory_deviation(scale, centres, centres_world) for scale in (first, second))
     by_triangulation = _is_first_better(first, second, of_first, of_second, reconstruction.metre_sigma)
     deviation = of_first if by_triangulation else of_second
@@ -244,12 +239,6 @@ def triangulated_ratios(references: Sequence[PosedView], correspondences: Corres
     return np.asarray(ratios[np.isfinite(ratios)])
 
 
-def pairs_of(count: int, max_cameras: int) -> NDArray[np.intp]:
-    """The pairs (P, 2) of at most `max_cameras` evenly chosen cameras of `count`."""
-    cameras = np.linspace(0, count - 1, min(count, max_cameras)).round().astype(np.intp)
-    return cameras[np.stack(np.triu_indices(len(cameras), 1), axis=1)]
-
-
 def trajectory_radius(centres: Array) -> float:
     """RMS distance of camera centres (K, 3) from their centroid, in their unit: r = sqrt(1/K sum |C_i - mean C|^2)."""
     return float(((centres - centres.mean(0)) ** 2).sum(1).mean() ** 0.5)
@@ -260,15 +249,17 @@ def trajectory_deviation(metres_per_unit: float, centres: Array, centres_world: 
     return abs(metres_per_unit * trajectory_radius(centres) / trajectory_radius(centres_world) - 1)
 
 
-def trajectory_scale(aligned: Array, centres_world: Array, pairs: NDArray[np.intp]) -> float:
+def trajectory_scale(aligned: Array, centres_world: Array) -> float:
     """S_traj, metres per unit: the scale with the most inliers, of equals that with the smallest RMS distance.
 
-    Every pair (P, 2) of cameras proposes the ratio of their known to their predicted distance. The predicted centres in
-    world axes, R_align C^local (K, 3), are scaled by it and shifted so that their centroid is that of the known ones
-    (K, 3), metres; cameras near their known centre are inliers. NaN when no pair has a distance in both trajectories.
+    Every pair of cameras proposes the ratio of their known to their predicted distance; the paper draws 500 at random.
+    The predicted centres in world axes, R_align C^local (K, 3), are scaled by it and shifted so that their centroid is
+    that of the known ones (K, 3), metres; cameras near their known centre are inliers. NaN when no pair has a distance
+    in both trajectories.
     """
+    first, second = np.triu_indices(len(aligned), 1)
     predicted, known = (
-        np.linalg.norm(centres[pairs[:, 0]] - centres[pairs[:, 1]], axis=1) for centres in (aligned, centres_world)
+        np.linalg.norm(centres[first] - centres[second], axis=1) for centres in (aligned, centres_world)
     )
     # Distances at the level of rounding propose no scale.
     apart = (predicted > 1e-6 * trajectory_radius(aligned)) & (known > 1e-6 * trajectory_radius(centres_world))
