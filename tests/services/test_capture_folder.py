@@ -96,6 +96,7 @@ def test_a_call_ahead_of_the_clock_is_deleted(tmp_path: Path) -> None:
     clock.now_s -= 31
     folder.tidy()
     assert files(tmp_path / "c") == []
+    assert not (tmp_path / "c" / "tenants" / "acme" / "calls" / "hall").exists()  # the name of the scene neither
     folder.close()
 
 
@@ -119,7 +120,9 @@ def test_what_version_0_3_left_is_deleted_in_time(tmp_path: Path) -> None:
 
 def test_what_a_killed_server_left_is_deleted_at_the_start(tmp_path: Path) -> None:
     (call,) = filled(tmp_path / "c")
-    call.with_name("x.call.tmp").write_bytes(b"half")
+    half = call.with_name("x.call.tmp")
+    half.write_bytes(b"half")
+    os.utime(half, (NOW_S, NOW_S))
     opened(tmp_path / "c").close()
     assert files(tmp_path / "c") == [call]
 
@@ -209,8 +212,9 @@ def test_a_folder_that_cannot_be_read_is_rejected(tmp_path: Path, monkeypatch: p
 def test_what_is_behind_a_link_is_deleted_in_time(tmp_path: Path) -> None:
     """As on another disk: what is written there is found again."""
     filled(tmp_path / "c")
-    (tmp_path / "c" / "tenants").rename(tmp_path / "elsewhere")
-    (tmp_path / "c" / "tenants").symlink_to(tmp_path / "elsewhere")
+    tenant = tmp_path / "c" / "tenants" / "acme"
+    tenant.rename(tmp_path / "elsewhere")
+    tenant.symlink_to(tmp_path / "elsewhere")
     clock = Clock()
     clock.now_s += 5000
     opened(tmp_path / "c", clock=clock).close()

@@ -23,6 +23,7 @@ from mapless import Client, wire
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.method.features.views import Features, PosedView, View
+from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal
@@ -30,6 +31,7 @@ from mapless_server.services.capture import recorder as recorder_module
 from mapless_server.services.capture.calls import decode_call
 from mapless_server.services.capture.folder import CaptureFolder, calls_of
 from mapless_server.services.capture.recorder import Recorder
+from mapless_server.settings import load_settings
 from mapless_server.store import SceneAttributes
 
 
@@ -48,7 +50,7 @@ class Counts(BackgroundObserver):
 
 
 def test_what_is_captured_is_marked(tmp_path: Path) -> None:
-    """Each photograph of a group, too, and none of a confidential call; and it is deleted without any further call."""
+    """Each photograph of a group, too, and none of a confidential call."""
     folder = tmp_path / "captured"
     about: dict[str, Any] = {"image": PHOTO, "intrinsics": wire.camera_to_message(CAMERA)}
     poses = [wire.transform_to_message(pose(x_m)) for x_m in (0.0, 0.1)]
@@ -62,7 +64,7 @@ def test_what_is_captured_is_marked(tmp_path: Path) -> None:
         ),
     }
     with (
-        serving(tmp_path / "data", capture_dir=folder, capture_hours=20 / 3600) as server,
+        serving(tmp_path / "data", capture_dir=folder) as server,
         Client(server.address) as client,
         grpc.insecure_channel(server.address) as channel,
     ):
@@ -78,8 +80,20 @@ def test_what_is_captured_is_marked(tmp_path: Path) -> None:
             request.options.confidential = True
             answer = getattr(stub, method)(request, timeout=LIMIT_S)
             assert not any(it.captured for it in recorder_module.diagnostics_of(answer))
-        wait_until(lambda: calls_of(folder) == [])
-        assert server.value("mapless_captured_total") == 3
+    assert len(calls_of(folder)) == 3
+
+
+def test_captured_calls_expire_without_any_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After as many hours as the settings say."""
+    monkeypatch.setattr(recorder_module, "circumstances_of", lambda *_: {})
+    settings = load_settings({"capture_dir": tmp_path / "captured", "capture_hours": 2 / 3600}).settings
+    recorder = recorder_module.open_recorder(settings, Metrics())
+    assert recorder is not None
+    answer(recorder)
+    wait_until(lambda: recorder.folder.disk_bytes)
+    wait_until(lambda: not recorder.folder.disk_bytes)
+    assert calls_of(tmp_path / "captured") == []
+    recorder.close()
 
 
 @contextmanager

@@ -198,5 +198,5 @@ def _replayed(
         comparison.apart_cm,
         comparison.apart_deg,
         comparison.changes,
-        damaged=tuple(references.damaged),
+        damaged=tuple(dict.fromkeys(references.damaged)),
     )

@@ -14,6 +14,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from uuid import uuid4
@@ -140,6 +141,8 @@ class CaptureFolder:
             log.error("captured call %s cannot be deleted: %s", path, error)
             return
         self.disk_bytes -= self._files.pop(path).disk_bytes
+        with suppress(OSError):  # other calls are in it
+            path.parent.rmdir()
 
     def _open(self) -> None:
         """Creates the folder if it does not exist, and locks it."""

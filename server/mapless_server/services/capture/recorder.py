@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 PACKAGES = ("numpy", "scipy", "opencv-python-headless", "poselib", "torch", "kornia")
 """Packages whose arithmetic decides answers."""
 
-DECISIVE_SETTINGS = ("device", "coverage", "retrieval", "max_batch", "compiled_views")
+DECISIVE_SETTINGS = ("device", "coverage", "retrieval", "reference_depth", "max_batch", "compiled_views")
 """Settings of which another value may change an answer, beside features, backend and weights."""
 
 MAX_QUEUED = 32
