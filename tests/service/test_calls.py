@@ -1,7 +1,6 @@
 """What every call has: a limit, a deadline, a request id, and errors with what the caller may know and no log."""
 
 import logging
-import time
 from collections.abc import Iterator
 from concurrent import futures
 from pathlib import Path
@@ -11,10 +10,18 @@ import grpc
 import pytest
 from google.rpc import error_details_pb2, status_pb2
 from grpc_health.v1 import health_pb2
-from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, pose, serving
+from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, localize_request, make_scene, pose, serving
 from support.waiting import wait_until
 
-from mapless import Client, ConnectOptions, DeadlineExceeded, LocalizationResult, NewReference, ResourceExhausted
+from mapless import (
+    Client,
+    ConnectOptions,
+    DeadlineExceeded,
+    LocalizationResult,
+    NewReference,
+    Rejected,
+    ResourceExhausted,
+)
 from mapless.requests import create_request
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import reference_service_pb2 as reference_pb
@@ -28,39 +35,32 @@ def pool() -> Iterator[futures.ThreadPoolExecutor]:
 
 
 def test_a_full_queue_refuses_with_a_retry_delay(tmp_path: Path, pool: futures.ThreadPoolExecutor) -> None:
+    calls: list[futures.Future[LocalizationResult | Rejected]] = []
+
+    def has_arrived() -> bool:
+        return calls[-1].done() or server.engine.queue.job_count == len(calls)
+
     with (
         serving(tmp_path, max_queued_s=2.0) as server,
-        Client(server.address) as client,
-        Client(server.address, ConnectOptions(max_attempts=1)) as impatient,
+        Client(server.address, ConnectOptions(max_attempts=1)) as client,
         server.method.held(),
     ):
-        scene = client.create_scene("s").scene_id
-        client.add_references(scene, [NewReference(f"r{i}", PHOTO, CAMERA, pose(i)) for i in range(3)])
-        admitted = [pool.submit(client.localize, PHOTO, CAMERA, scene) for _ in range(2)]
-        for _ in range(2):
-            assert server.method.started.acquire(timeout=20)
-        while True:  # further calls wait, until there is no room
-            waiting = pool.submit(impatient.localize, PHOTO, CAMERA, scene)
-            admitted.append(waiting)
-            before = len(admitted)
-            wait_until(lambda: waiting.done() or server.engine.queue.job_count == before)  # noqa: B023
-            if waiting.done():
-                admitted.pop()
-                break
-            assert before < 50
-        start_s = time.monotonic()
-        with pytest.raises(ResourceExhausted) as caught:
-            waiting.result(0)
-        assert time.monotonic() - start_s < 2
-        assert caught.value.reason == "QUEUE_FULL"
-        assert caught.value.retry_after_s is not None
-        assert 0 < caught.value.retry_after_s < 60
+        scene = make_scene(client, count=3)
+        while not calls or not calls[-1].done():
+            calls.append(pool.submit(client.localize, PHOTO, CAMERA, scene))
+            wait_until(has_arrived)
+            assert len(calls) < 50
+        refused = calls.pop().exception()
+        assert isinstance(refused, ResourceExhausted)
+        assert refused.reason == "QUEUE_FULL"
+        assert refused.retry_after_s is not None
+        assert 0 < refused.retry_after_s < 60
         # The loop is free meanwhile: what needs no thread is answered.
         assert client.is_serving()
         assert client.get_scene(scene).reference_count == 3
-        assert len(admitted) > 2
+        assert len(calls) > 2
         server.method.gate.set()
-        assert all(isinstance(future.result(30), LocalizationResult) for future in admitted)
+        assert all(isinstance(it.result(30), LocalizationResult) for it in calls)
     wait_until(lambda: server.engine.queue.job_count == 0)
 
 
