@@ -38,8 +38,12 @@ def main() -> int:
     given = parser.parse_args()
     for file in given.take:
         commit = given.commit or _git("rev-parse", "--short=8", "HEAD")
-        date = f"{datetime.fromtimestamp(file.stat().st_mtime, UTC):%Y-%m-%d}"
-        for name, rows in taken(json.loads(file.read_text(encoding="utf-8")), given.latency).items():
+        try:
+            tables = taken(json.loads(file.read_text(encoding="utf-8")), given.latency)
+            date = f"{datetime.fromtimestamp(file.stat().st_mtime, UTC):%Y-%m-%d}"
+        except (OSError, ValueError) as error:
+            parser.error(f"{file}: {error}")
+        for name, rows in tables.items():
             store(name, [row | {"commit": commit, "date": date} for row in rows])
     differing = [page for page in PAGES if current(text := page.read_text(encoding="utf-8")) != text]
     for page in differing:
@@ -161,12 +165,14 @@ TABLES: dict[str, Callable[[list[Row]], Iterable[list[str]]]] = {
 
 def taken(content: Row, with_latency: bool) -> dict[str, list[Row]]:
     """The rows of each table that a file of `bench`, `bench.load` or `evaluate --json` has; ValueError for others."""
+    if not isinstance(content, dict):
+        raise ValueError("no file of bench, bench.load or evaluate --json")
     if "pipeline" in content:
         return {"load": _load_rows(content["pipeline"])}
     if "per_query" in content:
         return {"references": [_scene_row(content)]}
     if "scenes" not in content or content["quick"]:
-        raise ValueError("neither a complete run of bench nor a file of bench.load or evaluate --json")
+        raise ValueError("neither a complete run of bench nor a file of bench.load pipeline or evaluate --json")
     rows = [_scene_row(it) for it in (*content["scenes"], *content["others"])]
     latency = _latency_rows(rows[0]["method"], content["latency"]) if with_latency else []
     return {"accuracy": rows, "latency": latency}
@@ -188,7 +194,7 @@ def _scene_row(measured: Row) -> Row:
         "wrong": measured["wrong"],
         "median": None if median is None else float(f"{100 * median:.4g}"),
         "unit": "cm" if metric else "%",
-        "median_deg": measured["median_rotation_deg"] and round(measured["median_rotation_deg"], 4),
+        "median_deg": measured["median_rotation_deg"] and float(f"{measured['median_rotation_deg']:.4g}"),
     }
 
 

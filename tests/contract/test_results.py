@@ -60,3 +60,24 @@ def test_new_figures_replace_those_of_the_same_scene(tmp_path: Path, monkeypatch
 def test_quick_runs_are_not_taken() -> None:
     with pytest.raises(ValueError, match="complete run"):
         results.taken({"quick": True, "scenes": [SCENE], "others": [], "latency": None}, with_latency=False)
+    with pytest.raises(ValueError, match="no file of bench"):
+        results.taken([], with_latency=False)  # type: ignore[arg-type]
+
+
+def test_rates_and_latencies_of_calls_are_taken() -> None:
+    step = {
+        "sent": 5,
+        "goodput_per_s": 2.0,
+        "refused_per_s": 1.0,
+        "answers": {"p50_ms": 10.0, "p95_ms": 20.0, "p99_ms": 30.0},
+        "refusals": {"max_ms": None},
+        "fates": {"overdue": 1, "answered": 4},
+    }
+    pipeline = {"unloaded": step, "steps": [step | {"share_of_saturation": 1.5}]}
+    alone, loaded = results.taken({"pipeline": pipeline}, with_latency=False)["load"]
+    assert (alone["offered"], loaded["offered"], loaded["overdue"]) == ("one at a time", "150 % of saturation", 1)
+    latency = {"first_pass_ms": [3.0, 1.0, 2.0], "warm_ms": [1.0], "cold_ms": [9.0], "memory_mib": {"peak_mib": 300.4}}
+    measured = {"quick": False, "scenes": [SCENE], "others": [], "latency": latency}
+    first, _, _, memory = results.taken(measured, with_latency=True)["latency"]
+    assert (first["figure"], first["median"]) == ("`auto`, every photograph for the first time", 2)
+    assert (memory["median"], memory["unit"]) == (300, "MiB")
