@@ -31,10 +31,10 @@ from mapless_server.scenes import Choice, RankedReference
 from .query import Tier
 
 MAX_PIXELS = 384 * 288
-"""Size of the reduced photograph, for less processor time. Measured: docs/decisions/constants.md."""
+"""Size of the reduced photograph, for less processor time. Evidence: tracking."""
 
 REFERENCES = 8
-"""Largest number of references near the prior. Measured: docs/decisions/constants.md."""
+"""Largest number of references near the prior. Evidence: tracking."""
 
 OTHERS = 2
 """References elsewhere that are compared."""

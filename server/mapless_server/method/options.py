@@ -44,7 +44,7 @@ class LocalizeOptions:
         variant: variant of the method.
         scale_strategy: how the metric scale is estimated.
         coverage: share of right answers to accept, in a difficult place; a larger share accepts more wrong answers too
-            (see `judge.judge`).
+            (see `judge.judge`). Evidence: coverage.
         intrinsics: standard deviations of the photograph's intrinsics; None for the defaults, which are smaller where
             the references have the same camera.
     """
@@ -63,11 +63,9 @@ class DoubtOptions:
     """When an accepted pose is doubtful.
 
     Attributes:
-        trust: a pose with less trust is doubtful. Of 2,528 photographs, many with few references, SIFT and EdgePoint2
-            had 115 off by over 5 % of the distance, 5 degrees or 25 cm; trying again below this trust tries 393, 114 of
-            these among them; below 0.2 it tries 335, 109 of these among them.
+        trust: a pose with less trust is doubtful. Evidence: low-trust.
         radius_m: a pose whose claimed 68 % radius is larger is doubtful: what a robot needs to pass a door.
-        inliers: a pose with fewer inliers is doubtful. Wide correspondences do not help above a hundred inliers.
+        inliers: a pose with fewer inliers is doubtful. Evidence: low-trust.
         promise: when a further attempt at a photograph in doubt is worth its time.
     """
 

@@ -53,7 +53,7 @@ class PromiseOptions:
         agreement, spread: the chance that a photograph shows what two references show is a logistic function of the
             agreement of its matches with both (see `features.rolls`): a half at the one, rising over the other.
             Evidence: place-agreement.
-        wrong_of_low_trust, wrong_otherwise: shares of the accepted poses that are wrong.
+        wrong_of_low_trust, wrong_otherwise: shares of the accepted poses that are wrong. Evidence: low-trust.
         wrong_if_confirmed: share of these that remains for each further kind of features that finds the same place.
         least_gain_per_s: photographs that a second of processor time must be expected to gain.
     """

@@ -27,7 +27,14 @@ from ..structure.model import MetricScale
 from ..structure.structure import query_tracks, with_query_points
 from .dispersion import scale_covariance
 from .estimate import PosedSupport, PoseEstimate, PoseStage
-from .intrinsics import PRINCIPAL, ContradictionOptions, IntrinsicsEvidence, IntrinsicsTerms, corrected_view
+from .intrinsics import (
+    DOUBTED_SIGMAS,
+    PRINCIPAL,
+    ContradictionOptions,
+    IntrinsicsEvidence,
+    IntrinsicsTerms,
+    corrected_view,
+)
 from .pose_problem import (
     AdjustInput,
     AdjustOptions,
@@ -43,12 +50,10 @@ from .priors import NO_PRIORS, IntrinsicsSigma, Priors
 
 WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
 """Least standard deviations of an estimated parameter's prior: focal length, k1, and shares of the width."""
-MAX_HELD = 3.0
-"""An estimate that leaves the prior by more standard deviations has diverged."""
 LINEAR_CHANGE = np.array([0.01, 0.01, 0.01, 0.02])
 """Changes, in the units of `WIDE_SIGMA`, below which keypoints move in proportion to them, to a tenth of a pixel."""
 LEAST_MATCHES = 20
-"""For a pose and intrinsics."""
+"""Fewer do not determine a pose and intrinsics, nor decide between cameras."""
 ROUGHLY = 2.0
 """Factor on `AdjustOptions.min_motion_sigma` before the photograph is read again."""
 
@@ -147,7 +152,7 @@ def _with_errors(
         bundle = optimum(wider, wider.at(there), rough).bundle
         pose, change, known = bundle.world_from_query, bundle.intrinsics, (problem.information, bundle.poses)
         errors = errors + change
-        if np.abs(errors / terms.held_sigma).max() > MAX_HELD:
+        if np.abs(errors / terms.held_sigma).max() > DOUBTED_SIGMAS:
             return None
         read = replace(given, query=corrected_view(query, errors))
         moved = replace(moved.with_points(used, bundle.points), query=read.query)
@@ -159,7 +164,7 @@ def _with_errors(
 
 SHARED_CAMERA = 0.03
 """Share of the intrinsics' usual errors that differ between photographs of one camera, by focus and stabilization. What
-they share is in the references' points too, and moves the pose but little."""
+they share is in the references' points too, and moves the pose but little. Evidence: adjustment."""
 
 
 def adjust_pose(given: AdjustInput, estimate: PoseEstimate, priors: Priors = NO_PRIORS) -> PoseEstimate:

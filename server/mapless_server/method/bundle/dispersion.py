@@ -60,7 +60,7 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 
 from ..features.tracks import summed
-from ..optim.optimize import cauchy_weight, take, world_jacobian
+from ..optim.optimize import LEAST_DAMPING, cauchy_weight, take, world_jacobian
 from .bundle import BundleProblem
 from .estimate import SUPPORTING_SHARE, gap_ratio
 from .intrinsics import IntrinsicsEquations
@@ -73,9 +73,9 @@ class UncertaintyOptions:
 
     Attributes:
         region_factor: factor on the standard deviations of the regions' part: the fit of the pose hides a part of the
-            errors that a region shares.
+            errors that a region shares. Evidence: radii.
         position_factor, rotation_factor: factors on standard deviations. Below 1, because noise of a single keypoint
-            is both in the references' part and in that of the regions.
+            is both in the references' part and in that of the regions. Evidence: radii.
         gap_growth: exponent of the gap in the factor on standard deviations. Larger ones make radii of the closest
             references too small.
         max_matches: largest number of the photograph's matches, evenly thinned; the time is linear in it.
@@ -92,9 +92,6 @@ class UncertaintyOptions:
         check_bounds(self, "gap_growth", at_least=0)
 
 
-DAMPING = 1e-9
-"""Relative, of the points: one without enough observations is determined, and has no information to speak of."""
-
 LEAST_EIGENVALUE = 1e-7
 """Least eigenvalue of the pose's information with unit diagonal: below, the pose is not determined."""
 
@@ -102,7 +99,8 @@ LEAST_VARIANCE = 1e-12
 """Least variance in S, as a share of I / w, where its point has no other observation but rounding."""
 
 LEAST_LEFT = 0.01
-"""Share of the pose's information added to what is left without a reference, which may not determine a pose."""
+"""Share of the pose's information added to what is left without a reference, which may not determine a pose. Evidence:
+references-left-out."""
 
 REGIONS = 3
 """Columns of the photograph, and regions in each."""
@@ -145,7 +143,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     weight = cauchy_weight((there.residual**2).sum(axis=0), problem.loss_scale_sigma)
     residual, weight = there.residual / weight, weight**2
     equations = seen.equations(replace(there, residual=residual), problem.loss_scale_sigma, weight=weight)
-    data, gradient, points = equations.reduced(DAMPING)
+    data, gradient, points = equations.reduced(LEAST_DAMPING)
     query, posed = problem.query_rows, slice(problem.query_rows.stop)
     prior, prior_gradient = np.zeros_like(data), np.zeros_like(gradient)
     held = slice(query.start)

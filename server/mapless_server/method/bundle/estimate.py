@@ -163,10 +163,11 @@ def observers(structure: Structure, points: NDArray[np.intp]) -> NDArray[np.intp
 
 
 TAIL_95 = 1.47
-"""Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Measured once (server/research)."""
+"""Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Evidence: radii."""
 
 SELF_TAIL_95 = 1.3
-"""The same for answers of a scene that is calibrated: the other one has to cover that scenes differ."""
+"""The same for answers of a scene that is calibrated: the other one has to cover that scenes differ. Evidence:
+self-calibration."""
 
 TAIL_PRIOR = 5.0
 """Number of a calibration's answers at which the factor is half-way between the two."""
@@ -197,10 +198,12 @@ def self_tail(count: int) -> float:
 
 
 JACKKNIFE_SHARE = 0.6
-"""Share of the jackknife's variance where halves count, too; alone it has to contain all of the errors."""
+"""Share of the jackknife's variance where halves count, too; alone it has to contain all of the errors. Evidence:
+references-left-out."""
 
 MOST_DISAGREEMENT = 3.0
-"""Largest half of the distance between halves that counts, in 68 % radii by the jackknife; beyond, one has failed."""
+"""Largest half of the distance between halves that counts, in 68 % radii by the jackknife; beyond, one has failed.
+Evidence: references-left-out."""
 
 
 def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
@@ -249,7 +252,7 @@ def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
 
 
 GROWTH = 0.2
-"""Exponent of the gap in the ratio of errors to radii, which contain 0.1 of it; measured once (server/research)."""
+"""Exponent of the gap in the ratio of errors to radii, which contain 0.1 of it. Evidence: self-calibration."""
 
 USUAL_GAP = 0.1
 """The gap at which factors are stated."""
@@ -258,7 +261,7 @@ LEAST_GAP, LARGEST_GAP = 0.03, 0.5
 """Beyond these, radii do not change with the gap."""
 
 SMALLEST_GAP = 0.01
-"""Below, the ratio of errors to radii does not change either."""
+"""Below, the ratio of errors to radii does not change either. Evidence: self-calibration."""
 
 SUPPORTING_SHARE = 0.1
 """References with fewer inliers, by those of the one with the most, do not hold the pose."""

@@ -32,9 +32,10 @@ from .significance import HEAVY_TAIL, least_sigmas
 PRINCIPAL = (1, 2)
 """Indices of the principal point among the four errors."""
 
-OTHER_CAMERA_SIGMAS = 3.0
-"""A photograph whose focal length or principal point is off by more, of standard deviations of an error that it alone
-has, does not share the references' camera."""
+DOUBTED_SIGMAS = 3.0
+"""Standard deviations from which on errors of the intrinsics are doubted: a photograph that is off by more of what
+it alone has does not share the references' camera; an estimate that leaves its prior by more has diverged; and if the
+linear check finds more, other cameras are tried. Evidence: other-cameras."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ def intrinsics_evidence(
         found, covariance = equations.estimate(removed, others, inflation, region_factor)
         value, sigma = np.diag(found), np.sqrt(np.einsum("iii->i", covariance))
         # A camera that errs otherwise than the references' is not theirs, though K is the same: its lens may differ.
-        is_other = np.abs(value) > OTHER_CAMERA_SIGMAS * np.hypot(held_sigma, sigma)
+        is_other = np.abs(value) > DOUBTED_SIGMAS * np.hypot(held_sigma, sigma)
         held_sigma = np.maximum(held_sigma, prior_sigma) if is_other[:3].any() else held_sigma
         doubtful = suspicion.contradicted(value, sigma, prior_sigma, given.camera.width_px)
         doubtful[:3] &= held_sigma[:3] >= prior_sigma[:3]  # K of a shared camera errs alike

@@ -35,7 +35,7 @@ from mapless_server.bounds import check_bounds
 
 from ..features.limits import INLIER_PX
 from ..features.views import Matches, PosedView, View
-from ..optim.optimize import MinimizeOptions, columns, minimize
+from ..optim.optimize import LEAST_DAMPING, MinimizeOptions, columns, minimize
 from ..structure.model import MIN_ADDED_SHARE, PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, free_problem
@@ -51,9 +51,6 @@ from .intrinsics import (
 from .normal_equations import Bundle, Linearized, NormalEquations, Poses
 from .priors import IntrinsicsSigma
 
-LEAST_DAMPING = 1e-9
-"""Keeps the points determined where they are eliminated at the given poses."""
-
 LEAST_EIGENVALUE = 1e-6
 """Directions with a smaller share of the largest eigenvalue are not observed: motions of the references as a whole."""
 LEAST_SPACING = 0.05
@@ -67,7 +64,7 @@ USUAL_OWN, USUAL_DRIFT, PRIOR_LOG = 0.1, 0.4, 1.5
 determine both, three do not. Reconstructions are smooth, so without evidence the poses drift."""
 OWN_INFLATION, DRIFT_INFLATION = 1.5, 2.0
 """Factors on the a and b that are found from residuals. Keypoints move with the viewpoint, by the same for far
-references, so the drift is larger than residuals say."""
+references, so the drift is larger than residuals say. Evidence: adjustment."""
 
 
 @dataclass(frozen=True)
@@ -84,16 +81,16 @@ class AdjustOptions:
         iterations: largest number of Levenberg-Marquardt steps.
         min_decrease: stop when a step lowers the cost by a smaller share.
         min_motion_sigma: stop when a step moves the pose by less, in standard deviations by the residuals; errors are
-            several of these.
+            several of these. Evidence: adjustment.
         least_curvature: see `BundleProblem`.
         suspicion: when an error of the intrinsics counts in full in the covariance.
         trial: when it is tried to estimate the intrinsics with the pose. A large error makes residuals large, where the
             loss hardly curves: with the intrinsics as given it seems undetermined, and is not where it is estimated.
-        agreeing_share: or when a smaller share of the matches are inliers.
+        agreeing_share: or when a smaller share of the matches are inliers. Evidence: adjustment.
         contradiction: when this estimate is used.
         rounds: how often, at most, the query's keypoints are corrected by an estimated parameter.
         min_added_share: keypoints that the query shares with references, and no point has, are adjusted too where there
-            are so many for each inlier.
+            are so many for each inlier. Evidence: adjustment.
         query_points: options of triangulating these.
         uncertainty: options of the answer's covariance.
     """

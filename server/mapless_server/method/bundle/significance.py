@@ -23,8 +23,8 @@ MAX_LOG10_CHANCE = -4.0
 
 HEAVY_TAIL = 1.47
 """Factor on the standard deviations of estimated errors, which are right at 68 %: the tails are heavier than those of a
-normal distribution, as those of radii (`estimate.TAIL_95`). For one parameter of four the bound is 6.77 of them; with
-6.75 under 1 % of right photographs are contradicted in each of eleven scenes (docs/decisions/constants.md)."""
+normal distribution, as those of radii (`estimate.TAIL_95`). For one parameter of four the bound is 6.77 of them.
+Evidence: accusation-chance."""
 
 
 def log10_chance(sigmas: float, tested: int) -> float:

@@ -13,11 +13,11 @@ from mapless.geometry import Array, RigidTransform
 
 from ..bundle.bundle import BundleProblem, free_problem
 from ..bundle.normal_equations import Bundle, Linearized, NormalEquations, Poses
-from ..bundle.pose_problem import LEAST_DAMPING, AdjustOptions, most_probable, pose_errors
+from ..bundle.pose_problem import AdjustOptions, most_probable, pose_errors
 from ..bundle.priors import Priors
 from ..features.tracks import Tracks
 from ..features.views import PosedView
-from ..optim.optimize import solve_step, world_jacobian
+from ..optim.optimize import LEAST_DAMPING, solve_step, world_jacobian
 from ..structure.model import PointMatches
 from ..structure.structure import tracks_with_query
 from .images import MatchedImage

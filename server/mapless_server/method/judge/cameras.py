@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Distortion, Fisheye
 
+from ..bundle.adjust import LEAST_MATCHES
 from ..bundle.estimate import PosedSupport, Support
-from ..bundle.intrinsics import ContradictionOptions, IntrinsicsEvidence, corrected, read_as
+from ..bundle.intrinsics import DOUBTED_SIGMAS, ContradictionOptions, IntrinsicsEvidence, corrected, read_as
 from ..bundle.priors import IntrinsicsSigma
 from ..bundle.significance import is_significant, sigmas_of_gains
 from ..features.views import View
@@ -117,18 +118,16 @@ def advice_for(lens: Distortion | None, wrong: Sequence[IntrinsicsCheck]) -> str
     )
 
 
-DOUBTED_SIGMAS, UNDETERMINED_FOCAL, UNDETERMINED_K1 = 3.0, 0.02, 0.05
-"""Other cameras are tried if the linear check finds a parameter off by more standard deviations, or leaves the focal
-length (as a share) or k1 more uncertain than this."""
+MANY_MATCHES = 100
+"""So many, with points or with one reference, are not chance."""
 
-MIN_GAIN, MANY_MATCHES, LARGE_SHARE, MIN_GAIN_ELSE = 1.1, 100, 0.45, 1.2
+MIN_GAIN, LARGE_SHARE, MIN_GAIN_ELSE = 1.1, 0.45, 1.2
 """A pose is rejected if one of another camera scores this many times as high, where there are many matches with points
 and no large share of them agrees with the pose; else if it scores 1.2 times as high. A pose that a large share agrees
-with is as right as its radii say, though its camera be a little wrong."""
+with is as right as its radii say, though its camera be a little wrong. Evidence: other-cameras."""
 
-MIN_MATCHES, MAX_LINES = 20, 1500
-"""Fewer matches with points do not decide. Of more matches with references, every second keypoint, or fewer, is
-compared."""
+MAX_LINES = 1500
+"""Of more matches with references, every second keypoint, or fewer, is compared."""
 
 UNUSUAL_PRINCIPAL_SHARE, UNUSUAL_ASPECT = 0.1, 0.03
 """Distance of the principal point from the centre, as a share of the width, from which the centre is tried too; share
@@ -156,6 +155,7 @@ class _Steps:
 
 
 BY_POINTS, BY_LINES = _Steps(5, 4, 3, 0.08), _Steps(2, 2, 1, 0.16)
+"""Coarse enough to miss no camera, and coarser where each takes longer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +287,7 @@ class Comparison:
 def compare_cameras(support: Support) -> Comparison | None:
     """Compares the photograph's camera with others by all of its matches; None if there are too few, or no others."""
     by_lines = isinstance(support, PosedSupport) and support.two_view is not None
-    if not by_lines and int((~support.matches.guided).sum()) < MIN_MATCHES:
+    if not by_lines and int((~support.matches.guided).sum()) < LEAST_MATCHES:
         return None
     query, steps = support.query, BY_LINES if by_lines else BY_POINTS
     prior_sigma = (support.intrinsics_sigma or IntrinsicsSigma()).of(query.camera)
@@ -346,7 +346,9 @@ def _difference(check: IntrinsicsCheck) -> str:
 def _is_doubtful(evidence: IntrinsicsEvidence) -> bool:
     """Whether the linear check speaks against the camera, or cannot speak for it."""
     off = np.abs(evidence.value) > DOUBTED_SIGMAS * np.hypot(evidence.sigma, evidence.prior_sigma)
-    return bool(off.any() or evidence.sigma[0] > UNDETERMINED_FOCAL or evidence.sigma[3] > UNDETERMINED_K1)
+    return bool(
+        off.any() or evidence.sigma[0] > ContradictionOptions.focal_share or evidence.sigma[3] > ContradictionOptions.k1
+    )
 
 
 def _other_cameras(given: Camera, prior_sigma: Array, steps: _Steps) -> Iterator[Camera]:

@@ -24,7 +24,7 @@ from ..bundle.estimate import PosedSupport, Support
 from ..features.limits import EPIPOLAR_PX, LOSS_SCALE_PX
 from ..features.tracks import keypoint_offsets
 from ..features.views import Matches, PosedView, View
-from ..optim.optimize import cauchy_weight, pose_jacobian
+from ..optim.optimize import LEAST_DAMPING, cauchy_weight, pose_jacobian
 from ..pose.pnp import PnpOptions, ransac
 from ..pose.two_view_matches import TwoViewMatches
 from ..structure.model import PixelPoints, PointMatches, Structure
@@ -35,8 +35,11 @@ MOST_POINTS = 2000
 LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
 """Below these evidence is not better or worse."""
 
-MAJORITY, LEAST_AGREEING = 0.5, 8
-"""Where a larger share of a half's matches agree with the pose, and so many, the half's own pose is near it."""
+MAJORITY = 0.5
+"""Share of a whole from which it counts as the whole."""
+
+LEAST_AGREEING = 8
+"""Where the majority of a half's matches agree with the pose, and so many, the half's own pose is near it."""
 
 LINEAR_SHARE, LINEAR_STEPS = 0.02, 5
 """Largest motion, and standard deviation, in which residuals are linear (of the distance, and radians); steps."""
@@ -44,9 +47,6 @@ LINEAR_SHARE, LINEAR_STEPS = 0.02, 5
 ROW, COLUMN = np.triu_indices(6)
 TWICE = np.where(ROW == COLUMN, 1.0, 2.0)
 """The elements of a symmetric matrix of the pose's motion, and how often each occurs."""
-
-LEAST_DAMPING = 1e-9
-"""Relative: a pose that matches do not determine has a large standard deviation, not none."""
 
 SPLITS = 3
 """Splits into halves, of which the median counts; one split may put all good matches into one half."""

@@ -13,7 +13,8 @@ from ..bundle.estimate import PosedSupport
 from ..features.views import PosedView, View
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .answer import Answer
-from .cameras import compare_cameras
+from .cameras import MANY_MATCHES, compare_cameras
+from .evidence import MAJORITY
 
 _STAGES = {
     RejectionReason.NO_USABLE_REFERENCES: "coarse",
@@ -40,11 +41,8 @@ FEW_FEATURES = 200
 FEW_MATCHES = 30
 """References of another place have fewer matches with a photograph by chance."""
 
-MANY_MATCHES = 100
-"""So many with one reference are not chance; if they have no common pose, something is wrong."""
-
-MUCH_IGNORED = 0.5
-"""Share of a photograph that masks seldom ignore: vehicles, grippers and people take less, inverted ones more."""
+LITTLE = 0.25
+"""Share of what is expected below which something is wrong."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +102,8 @@ def hinted(
             return replace(answer, outcome=replace(rejection, hint=hint, intrinsics_checks=compared.checks))
     advice, message = _advice(case)
     share = query.photograph.ignored_share if query.photograph else 0.0
-    if share >= MUCH_IGNORED or (share > 0 and case.features < FEW_FEATURES):
+    # Vehicles, grippers and people take less, inverted masks ignore more.
+    if share >= MAJORITY or (share > 0 and case.features < FEW_FEATURES):
         percent = f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
         message += f" The mask ignores {percent} of the image: 0 means ignore, every other value use."
     hint = Hint(_STAGES.get(rejection.reason, "judge") if references else "", advice, message, case.best)
@@ -155,9 +154,9 @@ def _of_overlap(case: _Case) -> tuple[Advice, str]:
             Advice.CHOOSE_OTHER_REFERENCES,
             f"Use references that show what the photograph shows: {shared}, no more than chance gives.",
         )
-    if case.matches >= MANY_MATCHES and case.tried is not None and case.tried < case.matches / 4:
+    if case.matches >= MANY_MATCHES and case.tried is not None and case.tried < LITTLE * case.matches:
         # Even if what two references show were independent, they would have so many of the features in common.
-        if case.tried < case.matches * case.second / case.features / 4 and case.second >= MANY_MATCHES:
+        if case.tried < LITTLE * case.matches * case.second / case.features and case.second >= MANY_MATCHES:
             return (
                 Advice.CHECK_CALIBRATION,
                 f"Check the references' poses, for which `mapless-server audit` helps: world_from_camera (not its "
@@ -186,7 +185,7 @@ def _of_overlap(case: _Case) -> tuple[Advice, str]:
 
 def _agrees_little(case: _Case) -> bool:
     """Whether one reference shares more with the photograph than chance could, and little of it agrees on a pose."""
-    return case.matches >= MANY_MATCHES and case.inliers < case.matches / 4
+    return case.matches >= MANY_MATCHES and case.inliers < LITTLE * case.matches
 
 
 def _retake(case: _Case) -> str:

@@ -40,17 +40,14 @@ from ..pose.one_reference import Found
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .cameras import wrong_camera, wrong_intrinsics
-from .evidence import Evidence, Votes, evidence_of, votes_of
+from .evidence import MAJORITY, Evidence, Votes, evidence_of, votes_of
 from .references import disagreeing_references, supporters_of
 
-RIVAL_MIN_SHARE, RIVAL_MIN_KEYPOINTS = 0.5, 10
-"""Least number of keypoints of a rival, as a share of those of the first pose, and in all."""
+RIVAL_MIN_KEYPOINTS = 10
+"""Least number of keypoints of a rival; it has the majority of those of the first pose, too."""
 
 RIVAL_MAX_LOG10_FALSE_ALARMS = -6.0
 """As `pnp.MAX_LOG10_FALSE_ALARMS`, but stricter, because a rival is searched for every answer."""
-
-RIVAL_MIN_OWN_SHARE = 0.5
-"""Least share of a rival's inliers from references that support it more than the first pose."""
 
 MIN_APART_M, MIN_APART_DEG = 0.1, 5.0
 """Poses nearer than this are one place, independent of their radii."""
@@ -64,7 +61,7 @@ but slightly wrong ones, and those from repeated structure, agree, too."""
 
 MAX_RADIUS_SHARE = 0.08
 """Largest 68 % radius of the position, as a share of the distance to what the photograph shows: of the poses with a
-larger one too many are wrong."""
+larger one too many are wrong. Evidence: largest-radius."""
 
 _RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
 LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -249,7 +246,7 @@ def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, Pos
     estimate, camera = support.estimate, support.query.camera
     errors_px = votes.seen.errors_px(estimate.world_from_camera)
     own = errors_px < RIVAL_PNP.inlier_px
-    wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(RIVAL_MIN_SHARE * votes.keypoint_count(own))))
+    wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(MAJORITY * votes.keypoint_count(own))))
     candidates = _outliers(votes, own, ~(errors_px < LOOSE_PX), len(support.references))
     if votes.keypoint_count(candidates) < wanted:
         return None
@@ -262,7 +259,7 @@ def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, Pos
         return None
     theirs = votes.seen.errors_px(pose) < RIVAL_PNP.inlier_px
     counts = [np.bincount(votes.reference[rows], minlength=len(support.references)) for rows in (own, theirs)]
-    if counts[1][counts[1] > counts[0]].sum() < RIVAL_MIN_OWN_SHARE * counts[1].sum():
+    if counts[1][counts[1] > counts[0]].sum() < MAJORITY * counts[1].sum():
         return None
     names = [reference.name for reference in support.references]
     return (

@@ -29,13 +29,14 @@ from .evidence import hull_px2
 from .references import moved_matches
 
 MAX_LOG10_POSE = -15.0
-"""Largest log10 of the expected number of such poses among wrong matches."""
+"""Largest log10 of the expected number of such poses among wrong matches. Evidence: epipolar-poses."""
 
 MAX_LOG10_DISTANCE = -5.0
 """The same limit for distances."""
 
 MIN_SECOND_SHARE = 0.35
-"""Least share of inliers among the matches of the reference with the second most inliers."""
+"""Least share of inliers among the matches of the reference with the second most inliers. Evidence:
+epipolar-poses."""
 
 SHARES = (0.253, 0.256, 0.274, 0.288, 0.331, 0.432, 0.476, 0.636)
 LEVELS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)

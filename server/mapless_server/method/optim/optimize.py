@@ -46,6 +46,9 @@ from scipy.spatial.transform import Rotation
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.bounds import check_bounds
 
+LEAST_DAMPING = 1e-9
+"""Relative damping that moves no solution, and leaves what observations do not determine with no information."""
+
 
 def perturbed(target_from_source: RigidTransform, step: Array) -> RigidTransform:
     """The pose after a left perturbation (v, w) (6,): a rotation by w about the target's origin, then a shift by v."""

@@ -49,8 +49,8 @@ class FitOptions:
     Attributes:
         median_ratio: median ratio of errors to their 68 % radius, if the radius is right.
         scatter: standard deviation of the logarithm of this ratio; that of the length of a normal error.
-        factor_log: standard deviation of ln f between scenes.
-        noise_share: standard deviation of s, as a share of the median radius.
+        factor_log: standard deviation of ln f between scenes. Evidence: self-calibration.
+        noise_share: standard deviation of s, as a share of the median radius. Evidence: self-calibration.
         trust_prior: n0 of the quantiles of trust.
         least_answers: with fewer right answers, the calibration changes nothing.
     """
