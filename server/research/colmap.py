@@ -33,7 +33,8 @@ from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
 from mapless_tools.output_files import whole_file, write_json
 
-KITCHEN = "7scenes-redkitchen-seq01-first600"
+from .places import KITCHEN, RIGHT_DEG, RIGHT_M, RIGHT_SHARE
+
 SCENES = (
     "fountain-P11",
     "herz-jesus-P8",
@@ -49,9 +50,6 @@ SCENES = (
     "statue-of-liberty-internet",
     "rendered-room",
 )
-RIGHT_SHARE, RIGHT_M, RIGHT_DEG = 0.05, 0.25, 5.0
-"""An answer is wrong that is off by a larger share of the distance to what the photograph shows, by more degrees or,
-in a scene in metres, by more metres."""
 LONG_SIDE_PX, KEYPOINTS = 1024, 2048
 """Those of mapless. COLMAP counts places, of which each has a keypoint for every orientation."""
 SPARSE = (5, 10, 20)

@@ -119,7 +119,8 @@ def test_a_page_keeps_its_text_and_gets_a_new_table() -> None:
         (["accusation-chance", "--nothing"], "unrecognized arguments"),
         (["accusation-chance", "EMPTY"], "has no scenes"),
         (["accusation-chance", "EMPTY/absent"], "has no scenes"),
-        (["same-place", "OTHER"], "cannot be read"),
+        (["same-place", "OTHER"], "none of the scenes"),
+        (["rungs", "OTHER"], "none of the scenes"),
         (["stationary-support", "OTHER"], "kitti-drive-a"),
     ],
 )
@@ -130,7 +131,7 @@ def test_wrong_usage_ends_with_2_and_leaves_the_page(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    (tmp_path / "other/place").mkdir(parents=True)
+    (tmp_path / "other/place/images").mkdir(parents=True)
     (tmp_path / "other/place/cameras.json").write_text('{"frames": [], "metric": true}')
     (tmp_path / "empty").mkdir()
     pages = tmp_path / "pages"

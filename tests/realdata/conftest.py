@@ -9,13 +9,13 @@ import pytest
 
 from mapless_tools.dataset import Dataset
 from mapless_tools.ingest.formats.cameras import read_folder
-from research.evidence.places import Place, read_place
+from research.described import Described, read_place
 
 DATA = Path(os.environ.get("TEST_DATA") or Path(__file__).parents[3] / "shared" / "data")
 
 
 @cache
-def read_place_once(name: str) -> Place:
+def read_place_once(name: str) -> Described:
     """A scene with the features of its photographs, for all tests."""
     return read_place(DATA / name)
 

@@ -18,7 +18,7 @@ from mapless_server.scenes.audit.coverage import check_coverage
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.resection import with_focal
 from mapless_tools.dataset import Dataset
-from research.evidence.places import Place, read_place
+from research.described import Described, read_place
 
 from .conftest import DATA, read_place_once
 
@@ -33,7 +33,7 @@ PAIRS = PairMatches()
 
 
 @cache
-def kitchen() -> Place:
+def kitchen() -> Described:
     """30 photographs, evenly spread."""
     return read_place(DATA / KITCHEN, wanted=np.linspace(0, 599, 30).round().astype(int).tolist())
 

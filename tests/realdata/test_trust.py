@@ -16,7 +16,7 @@ from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_tools.dataset import Dataset
-from research.evidence.places import METRIC, OTHERS, Measured, Pair, Place, answered, cross_pairs, right_pairs
+from research.described import METRIC, OTHERS, Described, Measured, Pair, answered, cross_pairs, right_pairs
 
 from .conftest import read_place_once
 
@@ -79,7 +79,7 @@ def test_a_scene_with_half_its_references_moved_is_ambiguous(photographs: Photog
     assert np.linalg.norm(centres[0] - centres[1]) == pytest.approx(5.0, abs=0.1)
 
 
-def all_places() -> dict[str, Place]:
+def all_places() -> dict[str, Described]:
     """All places, metric ones first, by name."""
     return {name: read_place_once(name) for name in dict.fromkeys([*(name for name, _ in METRIC), *OTHERS])}
 
@@ -175,7 +175,7 @@ def sensed(query: int, world_from_camera: RigidTransform, down_in_world: Array, 
     return Priors(gravity=GravityPrior(down / np.linalg.norm(down), down_in_world, 1.0))
 
 
-def measured(pairs: Sequence[Pair], place: Place, names: Sequence[str]) -> dict[str, list[Measured]]:
+def measured(pairs: Sequence[Pair], place: Described, names: Sequence[str]) -> dict[str, list[Measured]]:
     """Down is what most photographs of the place call down."""
     down = np.mean([pose.rotation[:, 1] for pose in place.poses.values()], axis=0)
     down /= np.linalg.norm(down)

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mapless_tools.output_files import check_writable, write_json
+from research.places import Scenes
 
 from .asking import Row, ask_all
-from .cases import KINDS, Case
+from .cases import KINDS, Case, cases_of
 from .comparing import report, table
-from .places import place_reader
 
 
 def main() -> None:
@@ -34,8 +34,7 @@ def main() -> None:
         if arguments.every < 1:
             parser.error(f"--every must be at least 1, is {arguments.every}")
         check_writable(arguments.json)
-        of = place_reader(arguments.scenes)
-        cases = [case for kind in arguments.only for case in list(KINDS[kind](of))[:: arguments.every]]
+        cases = cases_of(Scenes(arguments.scenes), arguments.only, arguments.every)
     except (OSError, ValueError) as error:
         parser.error(str(error))
     ask(cases, arguments.json)

@@ -10,17 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from mapless import Client, Debug, LocalizationResult, MaplessError, Rejected, RigidTransform
+from mapless import Client, LocalizationResult, MaplessError, Rejected, RigidTransform
 from mapless_tools.child import CONNECT, ChildServer, child_server
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.output_files import finite
+from research.places import Place, distance_seen, is_right
 
 from .cases import Case, Expected
-from .places import Place
 
-RIGHT_SHARE, RIGHT_M, RIGHT_DEG = 0.05, 0.25, 5.0
-"""An answer is wrong that is off by a larger share of the distance to what the photograph shows, by more degrees or,
-in a scene in metres, by more metres."""
 ENVIRONMENT = {"MAPLESS_BACKGROUND_MATCHING": "false"}
 """Work in the background would make answers depend on how long the others took."""
 Row = dict[str, Any]
@@ -94,8 +91,9 @@ def _of_rejection(answer: Rejected) -> Row:
 def _of_localization(case: Case, answer: LocalizationResult) -> Row:
     true, pose, debug = case.true_pose, answer.world_from_camera, answer.debug
     errors = pose_error(true, pose) if true is not None else (np.inf, np.inf)
-    seen = distance_seen(case, debug) if debug is not None else 0.0
-    is_right = case.expected not in (Expected.REJECTED, Expected.AMBIGUOUS) and is_near(case, *errors, seen)
+    seen = distance_seen(case.camera, true, debug.x_in_world) if true is not None and debug is not None else 0.0
+    has_pose = case.expected not in (Expected.REJECTED, Expected.AMBIGUOUS)
+    is_expected = has_pose and is_right(*errors, seen, case.place.dataset.metric)
     accuracy = answer.accuracy
     radii = None
     if accuracy is not None:
@@ -106,7 +104,7 @@ def _of_localization(case: Case, answer: LocalizationResult) -> Row:
             accuracy.rotation_95_deg,
         ]
     return {
-        "outcome": "right" if is_right else "wrong",
+        "outcome": "right" if is_expected else "wrong",
         "error": finite(errors[0]),
         "error_deg": finite(errors[1]),
         "distance_seen": seen,
@@ -118,23 +116,6 @@ def _of_localization(case: Case, answer: LocalizationResult) -> Row:
         "stage": answer.pose_stage,
         "priors": [str(it) for it in answer.prior_checks],
     }
-
-
-def is_near(case: Case, error: float, error_deg: float, seen: float) -> bool:
-    """Whether errors are small enough for a right answer to what is so far away."""
-    largest = RIGHT_SHARE * seen
-    return error <= (min(RIGHT_M, largest) if case.place.dataset.metric else largest) and error_deg <= RIGHT_DEG
-
-
-def distance_seen(case: Case, debug: Debug) -> float:
-    """Median depth of an answer's points that are inside the photograph at its true pose; 0 without any."""
-    if case.true_pose is None:
-        return 0.0
-    camera = case.camera
-    x_in_camera = case.true_pose.inverse().apply(debug.x_in_world)
-    projected = camera.project(x_in_camera)
-    inside = ((projected >= 0) & (projected < [camera.width_px, camera.height_px])).all(axis=1)
-    return float(np.median(x_in_camera[inside, 2])) if inside.any() else 0.0
 
 
 def _numbers(pose: RigidTransform) -> list[float]:

@@ -19,8 +19,19 @@ from mapless import (
 )
 from mapless.geometry import rotation_from_vector
 from mapless_tools.dataset import Frame
-
-from .places import APART, BOX, CAN, CHESS, FOUNTAIN, KITCHEN, LOCKERS, MEETING, STATUE, Place, PlaceOf
+from research.places import (
+    APART,
+    BOX,
+    CAN,
+    CHESS,
+    FOUNTAIN,
+    KITCHEN,
+    LOCKERS,
+    MEETING,
+    STATUE,
+    Place,
+    Scenes,
+)
 
 ELSEWHERE_RADII = 50.0
 """How far away a prior of another place is, in radii of the scene."""
@@ -57,35 +68,28 @@ def _case(kind: str, place: Place, frame: Frame, expected: Expected, form: str =
     return Case(kind, name, place, frame.image_path.read_bytes, frame.camera, pose, expected)
 
 
-def _plain(kind: str, of: PlaceOf, chosen: Sequence[tuple[str, int, int]]) -> Iterator[Case]:
-    for folder, references, count in chosen:
-        place = of(folder, references)
+def _plain(kind: str, scenes: Scenes, chosen: Sequence[tuple[str, int, int]]) -> Iterator[Case]:
+    for folder, references, count in scenes.present(chosen):
+        place = scenes.place(folder, references)
         for frame in place.queries(count):
             yield _case(kind, place, frame, Expected.RIGHT_OR_REJECTED)
 
 
-def repeated(of: PlaceOf) -> Iterator[Case]:
+def repeated(scenes: Scenes) -> Iterator[Case]:
     """Rows of equal lockers, a can whose print repeats on equal tiles, and a statue that looks alike from all sides."""
-    return _plain("repeated", of, [(LOCKERS, 8, 10), (LOCKERS, 10, 8), (CAN, 6, 8), (STATUE, 18, 12)])
+    return _plain("repeated", scenes, [(LOCKERS, 8, 10), (LOCKERS, 10, 8), (CAN, 6, 8), (STATUE, 18, 12)])
 
 
-def sparse(of: PlaceOf) -> Iterator[Case]:
+def sparse(scenes: Scenes) -> Iterator[Case]:
     """Few references, far apart."""
-    return _plain("sparse", of, [(KITCHEN, 3, 8), (MEETING, 5, 8), (FOUNTAIN, 3, 6), (CHESS, 5, 6)])
+    return _plain("sparse", scenes, [(KITCHEN, 3, 8), (MEETING, 5, 8), (FOUNTAIN, 3, 6), (CHESS, 5, 6)])
 
 
-def mirrored(of: PlaceOf) -> Iterator[Case]:
+def mirrored(scenes: Scenes) -> Iterator[Case]:
     """Photographs with left and right exchanged, as of a mirror: no pose is right."""
-    for folder, references, count in [
-        (KITCHEN, 10, 4),
-        (LOCKERS, 10, 4),
-        (FOUNTAIN, 5, 3),
-        (CAN, 6, 4),
-        (MEETING, 10, 4),
-        (STATUE, 18, 4),
-        (BOX, 8, 4),
-    ]:
-        place = of(folder, references)
+    asked = [(KITCHEN, 10, 4), (LOCKERS, 10, 4), (FOUNTAIN, 5, 3), (CAN, 6, 4), (MEETING, 10, 4), (STATUE, 18, 4)]
+    for folder, references, count in scenes.present([*asked, (BOX, 8, 4)]):
+        place = scenes.place(folder, references)
         for frame in place.queries(count):
             camera = frame.camera
             seen = replace(camera, principal_x_px=camera.width_px - 1 - camera.principal_x_px)
@@ -94,9 +98,9 @@ def mirrored(of: PlaceOf) -> Iterator[Case]:
             yield replace(case, image=image, camera=seen, true_pose=None)
 
 
-def turned(of: PlaceOf) -> Iterator[Case]:
+def turned(scenes: Scenes) -> Iterator[Case]:
     """Rasters that are turned by 90, 180 and 270 degrees, with their intrinsics."""
-    places = [of(*it) for it in ((KITCHEN, 10), (LOCKERS, 10), (FOUNTAIN, 5), (MEETING, 10))]
+    places = [scenes.place(*it) for it in scenes.present([(KITCHEN, 10), (LOCKERS, 10), (FOUNTAIN, 5), (MEETING, 10)])]
     asked = [(place, frame) for place in places for frame in place.queries(2)]
     for quarters in (1, 2, 3):
         for place, frame in asked:
@@ -141,9 +145,9 @@ TIGHT, LOOSE = (0.05, 2.0), (0.5, 15.0)
 """Standard deviations of priors: of positions, in radii of the scene, and of directions, degrees."""
 
 
-def right_priors(of: PlaceOf) -> Iterator[Case]:
+def right_priors(scenes: Scenes) -> Iterator[Case]:
     """Priors that are as far off as their standard deviations say, tight and loose, and limits that hold."""
-    for place, frame, i in _asked(of):
+    for place, frame, i in _asked(scenes):
         given = list(_priors_about(place, frame.world_from_camera, frame, frame.name).items())
         pose, limits = frame.world_from_camera, ("hard position and heading", _limits(place, frame.world_from_camera))
         for form, priors in _three(i, [*given, limits]):
@@ -151,9 +155,9 @@ def right_priors(of: PlaceOf) -> Iterator[Case]:
             yield replace(case, priors=priors, true_pose=pose)
 
 
-def wrong_priors(of: PlaceOf) -> Iterator[Case]:
+def wrong_priors(scenes: Scenes) -> Iterator[Case]:
     """Priors of photographs far away, of other directions and of other places, and limits that exclude the truth."""
-    for place, frame, i in _asked(of):
+    for place, frame, i in _asked(scenes):
         pose, far = frame.world_from_camera, place.far_from(frame)
         by_far = _priors_about(place, far, frame, frame.name)
         beyond = pose.shifted([ELSEWHERE_RADII * place.radius, 0.0, 0.0])
@@ -178,10 +182,10 @@ def wrong_priors(of: PlaceOf) -> Iterator[Case]:
             yield replace(_case("wrong-priors", place, frame, expected, form), priors=priors)
 
 
-def _asked(of: PlaceOf) -> Iterator[tuple[Place, Frame, int]]:
+def _asked(scenes: Scenes) -> Iterator[tuple[Place, Frame, int]]:
     """Places and photographs that are asked with priors, and their numbers."""
-    for i, (folder, references) in enumerate(PRIOR_PLACES):
-        place = of(folder, references)
+    for i, (folder, references) in enumerate(scenes.present(PRIOR_PLACES)):
+        place = scenes.place(folder, references)
         for j, frame in enumerate(place.queries(4)):
             yield place, frame, 4 * i + j
 
@@ -216,13 +220,16 @@ def _limits(place: Place, pose: RigidTransform) -> Priors:
     )
 
 
-def two_places(of: PlaceOf) -> Iterator[Case]:
+COPIED = ((KITCHEN, 10, 1), (FOUNTAIN, 5, 1), (BOX, 8, 2), (LOCKERS, 20, 2))
+
+
+def two_places(scenes: Scenes) -> Iterator[Case]:
     """Two places that look alike: without a prior both poses are as good, and a prior says which is meant.
 
     In some the second has half of the references, so that it explains less of the photograph.
     """
-    for folder, references, copy_stride in [(KITCHEN, 10, 1), (FOUNTAIN, 5, 1), (BOX, 8, 2), (LOCKERS, 20, 2)]:
-        place = of(folder, references, copy_stride)
+    for folder, references, copy_stride in scenes.present(COPIED):
+        place = scenes.place(folder, references, copy_stride)
         with_prior = Expected.RIGHT if copy_stride == 1 else Expected.RIGHT_OR_REJECTED
         without = Expected.AMBIGUOUS if copy_stride == 1 else Expected.RIGHT_OR_REJECTED
         for frame in place.queries(2):
@@ -256,9 +263,9 @@ CROSSED = (
 )
 
 
-def other_places(of: PlaceOf) -> Iterator[Case]:
+def other_places(scenes: Scenes) -> Iterator[Case]:
     """Photographs of each scene, asked in each of the others."""
-    places = [of(folder, references) for folder, references in CROSSED]
+    places = [scenes.place(folder, references) for folder, references in scenes.present(CROSSED)]
     for place in places:
         others = [it for it in places if it is not place]
         for frame, other in zip(place.queries(len(others)), others, strict=False):
@@ -266,7 +273,7 @@ def other_places(of: PlaceOf) -> Iterator[Case]:
             yield replace(case, true_pose=None)
 
 
-KINDS: dict[str, Callable[[PlaceOf], Iterator[Case]]] = {
+KINDS: dict[str, Callable[[Scenes], Iterator[Case]]] = {
     "sparse": sparse,
     "repeated": repeated,
     "mirrored": mirrored,
@@ -276,3 +283,11 @@ KINDS: dict[str, Callable[[PlaceOf], Iterator[Case]]] = {
     "two-places": two_places,
     "other-places": other_places,
 }
+
+
+def cases_of(scenes: Scenes, kinds: Sequence[str] = tuple(KINDS), every: int = 1) -> list[Case]:
+    """Every so many-th case of each kind, in the scenes that there are; ValueError without any."""
+    found = [case for kind in kinds for case in list(KINDS[kind](scenes))[::every]]
+    if not found:
+        raise ValueError(f"{scenes.folder} has none of the scenes of the cases {', '.join(kinds)}")
+    return found

@@ -17,16 +17,14 @@ from mapless_server.method.options import StageContext
 from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.method.promise import PROMISE
 from mapless_tools.dataset import Frame
-from mapless_tools.evaluate.plan import evenly_spread
-from research.contradictions.places import Place, place_reader
-from research.doubt.scenes import FOLDERS, PLACES
-from research.doubt.turning import turned, turned_image
+from research.places import Place, Scenes, own_and_other
 
 from .page import Measurement, Row
+from .turning import turned, turned_image
 
 PIXELS = (320 * 240, 480 * 360, 640 * 480, 960 * 720, None)
 ANGLE_DEG = 45
-QUERIES, FEW = 2, 5
+QUERIES = 2
 CONTEXT = StageContext()
 
 
@@ -54,17 +52,8 @@ def rows(found: Sequence[Found]) -> Iterator[Row]:
 
 
 def _all_found(scenes: Path) -> Iterator[Found]:
-    of = place_reader(scenes)
-    for number, folder in enumerate(FOLDERS):
-        place = of(folder, FEW)
-        foreign = [it for it in FOLDERS if not any({it, folder} <= set(one) for one in PLACES)]
-        other = of(foreign[(5 * number + 3) % len(foreign)], FEW).dataset.frames[0]
-        yield from _found(place, [*((it, True) for it in _queries(place)), (other, False)])
-
-
-def _queries(place: Place) -> Sequence[Frame]:
-    others = [it for it in place.dataset.frames if it not in place.reference_frames]
-    return [others[i] for i in evenly_spread(range(len(others)), min(QUERIES, len(others)))]
+    for _, place, own, others in own_and_other(Scenes(scenes), QUERIES):
+        yield from _found(place, [*((it, True) for it in own), *((it, False) for it in others)])
 
 
 def _found(place: Place, asked: Sequence[tuple[Frame, bool]]) -> Iterator[Found]:

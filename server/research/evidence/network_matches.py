@@ -16,16 +16,13 @@ from mapless_server.method.pairs.epipolar import sampson_px
 from mapless_server.serve.assembly import make_tiers
 from mapless_server.settings import load_settings
 from mapless_tools.dataset import Frame
-from mapless_tools.evaluate.plan import evenly_spread
-from research.contradictions.places import Place, place_reader
-from research.doubt.scenes import FOLDERS, PLACES
+from research.places import Scenes, own_and_other
 
 from .page import Measurement, Row
 
 KEYPOINTS = (256, 512, 1024)
 THRESHOLDS = (10, 15, 20, 30, 40)
-COUNTS = {"7scenes-redkitchen-seq01-first600": 3, "office-lockers": 12, "statue-of-liberty-internet": 20}
-QUERIES, FEW, BEST = 2, 5, 2
+QUERIES, BEST = 2, 2
 RIGHT_PX, ENOUGH_RIGHT = 4.0, 15
 
 
@@ -71,19 +68,11 @@ def by_threshold(found: Sequence[Found]) -> Iterator[Row]:
 
 def _all_found(scenes: Path) -> Iterator[Found]:
     tier = make_tiers(load_settings({}).settings)[-1]
-    of, matcher = place_reader(scenes), tier.pipeline.matcher
-    for number, folder in enumerate(FOLDERS):
-        place = of(folder, COUNTS.get(folder, FEW))
+    matcher = tier.pipeline.matcher
+    for _, place, own, others in own_and_other(Scenes(scenes), QUERIES):
         references = [_posed(it, tier) for it in place.reference_frames]
-        foreign = [it for it in FOLDERS if not any({it, folder} <= set(one) for one in PLACES)]
-        other = of(foreign[(5 * number + 3) % len(foreign)], FEW)
-        for frame, is_own in [*((it, True) for it in _queries(place)), (other.dataset.frames[number % 3], False)]:
+        for frame, is_own in [*((it, True) for it in own), *((it, False) for it in others)]:
             yield from _found(_posed(frame, tier), references, matcher, is_own)
-
-
-def _queries(place: Place) -> Sequence[Frame]:
-    others = [it for it in place.dataset.frames if it not in place.reference_frames]
-    return [others[i] for i in evenly_spread(range(len(others)), min(QUERIES, len(others)))]
 
 
 def _posed(frame: Frame, tier: Tier) -> PosedView:

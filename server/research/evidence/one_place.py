@@ -29,12 +29,10 @@ from mapless_server.services.messages.queries import priors_from_message
 from mapless_server.store.records import SceneAttributes
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.references import choose_references
-from research.contradictions.asking import is_near
-from research.contradictions.cases import KINDS, Case, Expected
-from research.contradictions.places import Place, place_reader
+from research.contradictions.cases import Case, Expected, cases_of
+from research.places import Place, Scenes, distance_seen, is_right
 
 from .page import Measurement, Row
-from .places import distance_seen
 
 ASKED = ("sparse", "repeated", "two-places", "right-priors", "wrong-priors")
 REFERENCES = 10
@@ -92,13 +90,14 @@ def _outcome(asked: Asked, options: PlaceOptions) -> str:
     if case.true_pose is None or support is None or case.expected in (Expected.REJECTED, Expected.AMBIGUOUS):
         return "wrong"
     errors = pose_error(case.true_pose, outcome.world_from_camera)
-    return "right" if is_near(case, *errors, distance_seen(support, case.true_pose)) else "wrong"
+    distance = distance_seen(support.query.camera, case.true_pose, support.structure.x_in_world + support.origin)
+    return "right" if is_right(*errors, distance, case.place.dataset.metric) else "wrong"
 
 
 @cache
 def _asked(scenes: Path) -> Sequence[Asked]:
     """Computes the attempts of each case."""
-    extractor, of = make_extractor("sift"), place_reader(scenes)
+    extractor = make_extractor("sift")
     pipeline = Pipeline(make_reconstructor("geometric", Path()), make_matcher("sift", 2))
 
     @cache
@@ -113,22 +112,21 @@ def _asked(scenes: Path) -> Sequence[Asked]:
         ]
 
     asked = list[Asked]()
-    for kind in ASKED:
-        for case in KINDS[kind](of):
-            if "limit" in case.name:
-                continue
-            query = extractor.extract(decode_image(case.image(), ImageLimits()), case.camera)
-            every = references_of(case.place)
-            chosen = choose_references(query, every, REFERENCES, ratio=OPTIONS["sift"].query_ratio)
-            priors = _method_priors(case)
-            references = [every[i] for i in chosen]
-            prepared = prepare(query, references, pipeline, LocalizeOptions(), StageContext(), priors=priors)
-            if isinstance(prepared, Rejection):
-                continue
-            (coarse,) = reconstruct([prepared])
-            if isinstance(coarse, Exception):
-                raise coarse
-            asked.append(Asked(case, [found for found, _ in attempts(coarse, DoubtOptions())], priors))
+    for case in cases_of(Scenes(scenes), ASKED):
+        if "limit" in case.name:
+            continue
+        query = extractor.extract(decode_image(case.image(), ImageLimits()), case.camera)
+        every = references_of(case.place)
+        chosen = choose_references(query, every, REFERENCES, ratio=OPTIONS["sift"].query_ratio)
+        priors = _method_priors(case)
+        references = [every[i] for i in chosen]
+        prepared = prepare(query, references, pipeline, LocalizeOptions(), StageContext(), priors=priors)
+        if isinstance(prepared, Rejection):
+            continue
+        (coarse,) = reconstruct([prepared])
+        if isinstance(coarse, Exception):
+            raise coarse
+        asked.append(Asked(case, [found for found, _ in attempts(coarse, DoubtOptions())], priors))
     pipeline.matcher.close()
     return asked
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from research.contradictions.asking import Row as Answer
 from research.contradictions.asking import ask_all
-from research.contradictions.cases import KINDS
-from research.contradictions.places import place_reader
+from research.contradictions.cases import cases_of
+from research.places import Scenes
 
 from .page import Measurement, Row
 
@@ -18,8 +18,7 @@ EVERY = 3
 
 
 def _rows(scenes: Path) -> Iterator[Row]:
-    of = place_reader(scenes)
-    return earned(ask_all([case for kind in KINDS.values() for case in list(kind(of))[::EVERY]]))
+    return earned(ask_all(cases_of(Scenes(scenes), every=EVERY)))
 
 
 def earned(answers: Iterable[Answer]) -> Iterator[Row]:

@@ -22,7 +22,7 @@ from mapless_server.settings import load_settings
 from mapless_server.store import NewReference, SceneAttributes, Store
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.formats.cameras import read_folder
-from research.contradictions.places import spread
+from research.places import spread
 
 from .page import Measurement, Row
 

@@ -28,12 +28,12 @@ from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.plan import evenly_spread
 from mapless_tools.evaluate.references import choose_references
 from mapless_tools.ingest.formats.cameras import read_folder
+from research.places import DRIVE, KITCHEN, RIGHT_M
 
 from .overlays import OVERLAYS, Image, Mask, Overlay, black, nothing
 from .page import Measurement, Row, least
 
 ROOM = Path(__file__).parents[2] / "mapless_tools" / "demo" / "room"
-KITCHEN, DRIVE = "7scenes-redkitchen-seq01-first600", "kitti-drive-a"
 REFERENCES = 10
 """References of a query."""
 QUERIES = 6
@@ -44,7 +44,6 @@ UNCHECKED = 2
 """How many of those of other places are asked with nothing ignored too."""
 MAX_KEYPOINTS = 1024
 """Half of what a server takes, so that all is measured in minutes."""
-RIGHT_M = 0.25
 OFF = StationaryOptions(support=1_000_000, unmoved_px=0.0)
 
 

@@ -4,9 +4,9 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 
 from mapless_server.method.promise import PROMISE, WORTH
-from research.contradictions.places import place_reader
-from research.doubt.climbing import Climb, climbs
+from research.places import Scenes
 
+from .climbing import Climb, climbs
 from .page import Measurement, Row
 
 THRESHOLDS = (1.5, 2.0, 2.4, 2.7, 3.0, 4.0, 6.0)
@@ -89,6 +89,6 @@ def _row(name: str, chosen: Sequence[tuple[Climb, bool]]) -> Row:
 
 
 MEASUREMENTS = {
-    "rungs-worth": Measurement(lambda scenes: shares(list(climbs(place_reader(scenes))))),
-    "place-agreement": Measurement(lambda scenes: agreements(list(climbs(place_reader(scenes))))),
+    "rungs-worth": Measurement(lambda scenes: shares(list(climbs(Scenes(scenes))))),
+    "place-agreement": Measurement(lambda scenes: agreements(list(climbs(Scenes(scenes))))),
 }

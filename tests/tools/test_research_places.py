@@ -1,7 +1,6 @@
-"""Questions and sums of `research.doubt`: turned rasters, crossed places, the list, and its tables."""
+"""Scenes of a folder, those of other places, and turned rasters."""
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,11 +10,9 @@ from mapless import Camera, RadialTangential, RigidTransform
 from mapless.geometry import rotation_from_vector
 from mapless_tools.output_files import write_json
 from research.contradictions.cases import quarter_turn
-from research.contradictions.places import place_reader
-from research.doubt.cases import doubtful, write_list
-from research.doubt.scenes import FOLDERS, PLACES, crossed
-from research.doubt.tables import by, by_angle
-from research.doubt.turning import turned, turned_pixels
+from research.evidence.turning import turned, turned_pixels
+from research.other_places import crossed
+from research.places import Scenes, own_and_other
 
 LENS = RadialTangential(-0.1, 0.02, 0.001, -0.002)
 CAMERA = Camera(160, 120, 150.0, 160.0, 76.0, 63.0, LENS)
@@ -64,59 +61,36 @@ def test_corners_that_the_photograph_does_not_show_are_black() -> None:
     assert raster[raster.shape[0] // 2, raster.shape[1] // 2] == 200
 
 
-def test_crossed_folders_are_never_of_one_place() -> None:
-    place_of = {folder: i for i, folders in enumerate(PLACES) for folder in folders}
-    pairs = crossed(200)
-    assert len(set(pairs)) == 200
-    assert all(place_of[a] != place_of[b] for a, b in pairs)
-    assert {a for a, _ in pairs} == set(FOLDERS)
-    assert len(crossed(2000)) == 2000
-
-
-def planted_folder(folder: Path) -> None:
-    (folder / "shelf/images").mkdir(parents=True)
+def planted_folder(folder: Path, name: str, count: int = 6) -> None:
+    (folder / name / "images").mkdir(parents=True)
     frames = []
-    for i in range(6):
-        cv2.imwrite(str(folder / f"shelf/images/{i}.png"), np.zeros((4, 4), np.uint8))
+    for i in range(count):
+        cv2.imwrite(str(folder / name / f"images/{i}.png"), np.zeros((4, 4), np.uint8))
         k = [[5, 0, 1.5], [0, 5, 1.5], [0, 0, 1]]
         pose = RigidTransform(np.eye(3), np.array([0.1 * i, 0, 0])).matrix().tolist()
         frames.append({"image": f"images/{i}.png", "width": 4, "height": 4, "K": k, "world_from_camera": pose})
-    write_json(folder / "shelf/cameras.json", {"frames": frames, "metric": True})
+    write_json(folder / name / "cameras.json", {"frames": frames, "metric": True})
 
 
-def test_list_names_what_was_expensive_and_is_asked_again(tmp_path: Path) -> None:
-    planted_folder(tmp_path)
-    rows = [
-        {"folder": "shelf", "references_stored": 3, "photograph": name, "processor_s": spent_s}
-        for name, spent_s in (("1", 2.5), ("3", 1.5), ("4", 9.0))
-    ]
-    write_list(rows, tmp_path / "list.json")
-    asked = list(doubtful(place_reader(tmp_path), tmp_path / "list.json"))
-    assert [(it.case.name, it.fields["references_stored"]) for it in asked] == [
-        ("1 in shelf-3", 3),
-        ("4 in shelf-3", 3),
-    ]
-    write_list([rows[0] | {"photograph": "gone"}], tmp_path / "list.json")
-    with pytest.raises(ValueError, match="shelf has no photograph gone"):
-        list(doubtful(place_reader(tmp_path), tmp_path / "list.json"))
+def test_crossed_scenes_are_never_of_one_place(tmp_path: Path) -> None:
+    for name in ("shelf", "depth/tum-teddy", "tum-fr3-office"):
+        planted_folder(tmp_path, name)
+    scenes = Scenes(tmp_path)
+    assert scenes.names == ["depth/tum-teddy", "shelf", "tum-fr3-office"]
+    pairs = crossed(scenes, 4)
+    assert len(set(pairs)) == 4
+    assert {frozenset(it) for it in pairs} == {frozenset(("shelf", it)) for it in ("depth/tum-teddy", "tum-fr3-office")}
+    assert len(crossed(scenes, 10)) == 10
+    assert scenes.present([("shelf", 1), ("absent", 2)]) == [("shelf", 1)]
 
 
-def turned_row(photograph: str, angle_deg: int, outcome: str, processor_s: float) -> dict[str, Any]:
-    return {
-        "folder": "shelf",
-        "photograph": photograph,
-        "angle_deg": angle_deg,
-        "outcome": outcome,
-        "processor_s": processor_s,
-        "attempts": [{}],
-    }
-
-
-def test_turned_photographs_are_compared_with_themselves_upright() -> None:
-    rows = [turned_row("a", 0, "right", 0.5), turned_row("b", 0, "LOW_OVERLAP", 9.0), turned_row("c", 0, "right", 1.0)]
-    rows += [turned_row("a", 90, "right", 1.0), turned_row("b", 90, "right", 1.0), turned_row("c", 90, "wrong", 4.0)]
-    assert by_angle(rows)[2:] == [
-        "| 0 | 2 | 2 (100 %) | 0 | 0 | 0.75 | 0.97 | 1.00 | 1.00 |",
-        "| 90 | 2 | 1 (50 %) | 1 | 0 | 2.50 | 3.85 | 3.00 | 3.33 |",
-    ]
-    assert by("degrees", lambda row: row["angle_deg"], rows)[-1] == "| all | 6 | 4 | 1 | 1 | 1.00 | 7.75 | 1.0 |"
+def test_a_place_is_asked_with_photographs_of_its_own_and_another(tmp_path: Path) -> None:
+    for name in ("hall", "shelf"):
+        planted_folder(tmp_path, name, 9)
+    (hall, shelf) = own_and_other(Scenes(tmp_path), 2)
+    for (name, place, own, others), other in ((hall, "shelf"), (shelf, "hall")):
+        assert len(place.reference_frames) == 5
+        assert len(own) == 2
+        assert not {it.image_path for it in own} & {it.image_path for it in place.reference_frames}
+        assert [name in str(it.image_path) for it in own] == [True, True]
+        assert [f"/{other}/" in str(it.image_path) for it in others] == [True]

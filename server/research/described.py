@@ -1,6 +1,6 @@
-"""Photographs with known poses and references for them: of their own place, few and far apart, and of another place.
+"""Photographs with features, and answers to them by the method's own modules, in this process, without a server.
 
-The method's own modules work on them in this process, without a server. Folders have `cameras.json`.
+A query has references of its own place, few and far apart, or of another place.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,7 +12,7 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.bundle.estimate import PosedSupport, Support
+from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.bundle.priors import NO_PRIORS, Priors
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import make_extractor
@@ -28,18 +28,16 @@ from mapless_tools.evaluate.plan import evenly_spread
 from mapless_tools.evaluate.references import choose_references
 from mapless_tools.ingest.formats.cameras import read_folder
 
-RIGHT_SHARE, RIGHT_M, RIGHT_DEG = 0.05, 0.25, 5.0
-"""An answer is wrong that is off by a larger share of the distance to what the photograph shows, by more degrees or,
-in a scene in metres, by more metres."""
-KITCHEN = "7scenes-redkitchen-seq01-first600"
+from .places import DRIVE, FOUNTAIN, KITCHEN, OFFICE, distance_seen, is_right
+
 METRIC: tuple[tuple[str, int | None], ...] = (
-    ("fountain-P11", None),
+    (FOUNTAIN, None),
     ("herz-jesus-P8", None),
     (KITCHEN, 30),
     (KITCHEN, 10),
     (KITCHEN, 5),
-    ("tum-fr3-office", None),
-    ("kitti-drive-a", None),
+    (OFFICE, None),
+    (DRIVE, None),
 )
 """Folders and how many frames, evenly spread, are references; None leaves one out."""
 OTHERS = ("fox-portrait", "reichstag-internet")
@@ -49,7 +47,7 @@ CROSS_REFERENCES = 30
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class Described:
     """A scene's photographs with their features, by the frame's index."""
 
     name: str
@@ -102,11 +100,13 @@ class Measured:
         """Whether there is a pose that is near enough to the truth."""
         if self.off is None or self.pair.true_pose is None or self.answer.support is None:
             return False
-        largest = RIGHT_SHARE * distance_seen(self.answer.support, self.pair.true_pose)
-        return self.off[0] <= (min(RIGHT_M, largest) if self.pair.metric else largest) and self.off[1] <= RIGHT_DEG
+        support = self.answer.support
+        x_in_world = support.structure.x_in_world + support.origin
+        distance = distance_seen(support.query.camera, self.pair.true_pose, x_in_world)
+        return is_right(*self.off, distance, self.pair.metric)
 
 
-def read_place(folder: Path, wanted: Sequence[int] | None = None) -> Place:
+def read_place(folder: Path, wanted: Sequence[int] | None = None) -> Described:
     """The scene of a folder, with SIFT features; `wanted` are indices of frames, else evenly spread ones."""
     extractor, dataset = make_extractor("sift"), read_folder(folder)
     frames = dataset.frames
@@ -118,7 +118,7 @@ def read_place(folder: Path, wanted: Sequence[int] | None = None) -> Place:
     indices = range(0, len(frames), max(1, len(frames) // FRAMES)) if wanted is None else wanted
     with ThreadPoolExecutor(2) as pool:
         views = pool.map(view_of, indices)
-        return Place(
+        return Described(
             folder.name,
             dict(zip(indices, views, strict=True)),
             {i: frames[i].world_from_camera for i in indices},
@@ -126,7 +126,9 @@ def read_place(folder: Path, wanted: Sequence[int] | None = None) -> Place:
         )
 
 
-def right_pairs(place: Place, reference_count: int | None, ks: Sequence[int], frames_apart: int = 0) -> Iterator[Pair]:
+def right_pairs(
+    place: Described, reference_count: int | None, ks: Sequence[int], frames_apart: int = 0
+) -> Iterator[Pair]:
     """Queries of a scene with k of its references each, or all where it has fewer.
 
     So many references are evenly spread, and queries between them; None leaves one out. References within so many
@@ -149,7 +151,7 @@ def right_pairs(place: Place, reference_count: int | None, ks: Sequence[int], fr
             yield Pair(title, k, place.views[query], chosen[:k], place.poses[query], metric=place.metric)
 
 
-def cross_pairs(places: Sequence[Place], queries_each: int, k: int = 10) -> Iterator[Pair]:
+def cross_pairs(places: Sequence[Described], queries_each: int, k: int = 10) -> Iterator[Pair]:
     """Queries of each scene, evenly spread, with references of every other."""
     for place in places:
         queries = evenly_spread(sorted(place.views), queries_each)
@@ -182,12 +184,3 @@ def _error(pair: Pair, answer: Answer) -> tuple[float, float] | None:
     else:
         return None
     return pose_error(pair.true_pose, pose) if pair.true_pose is not None else (np.inf, np.inf)
-
-
-def distance_seen(support: Support, true_pose: RigidTransform) -> float:
-    """Median depth of the points that are inside the photograph at its true pose; 0 without any."""
-    camera, x_in_world = support.query.camera, support.structure.x_in_world
-    x_in_camera = true_pose.shifted(-support.origin).inverse().apply(x_in_world)
-    projected = camera.project(x_in_camera)
-    inside = ((projected >= 0) & (projected < [camera.width_px, camera.height_px])).all(axis=1)
-    return float(np.median(x_in_camera[inside, 2])) if inside.any() else 0.0

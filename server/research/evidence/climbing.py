@@ -25,16 +25,10 @@ from mapless_server.settings import load_settings
 from mapless_server.store import NewReference, SceneAttributes, Store
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
-from research.contradictions.asking import RIGHT_DEG, RIGHT_M, RIGHT_SHARE
-from research.contradictions.places import Place, PlaceOf
-
-from .scenes import FOLDERS, PLACES
+from research.places import Place, Scenes, is_right, own_and_other
 
 ALL = EngineOptions(doubt=DoubtOptions(promise=PromiseOptions(least_gain_per_s=0.0)), workers=1)
 """Every attempt is made."""
-COUNTS = {"7scenes-redkitchen-seq01-first600": 3, "office-lockers": 12, "statue-of-liberty-internet": 20}
-FEW = 5
-"""References of a folder: so few that photographs are in doubt."""
 OWN, OTHERS = 6, 2
 """Photographs of a folder, and of others, that are asked in it."""
 SCENE = SceneKey("climbs")
@@ -58,24 +52,19 @@ class Climb:
     attempts: tuple[Tried, ...]
 
 
-def climbs(of: PlaceOf, folders: Sequence[str] = FOLDERS) -> Iterator[Climb]:
-    """Photographs of each folder and of others, asked in it."""
-    for number, folder in enumerate(folders):
-        place = of(folder, COUNTS.get(folder, FEW))
-        if len(place.dataset.frames) < FEW + 3:
-            continue
-        foreign = [it for it in FOLDERS if not any({it, folder} <= set(one) for one in PLACES) and it != folder]
-        others = [of(foreign[(number + 5 * i) % len(foreign)], FEW).dataset.frames[i] for i in range(OTHERS)]
-        yield from _asked(folder, place, others)
+def climbs(scenes: Scenes) -> Iterator[Climb]:
+    """Photographs of each scene and of others, asked in it."""
+    for name, place, own, others in own_and_other(scenes, OWN, OTHERS):
+        yield from _asked(name, place, own, others)
 
 
-def _asked(folder: str, place: Place, others: Sequence[Frame]) -> Iterator[Climb]:
+def _asked(folder: str, place: Place, own: Sequence[Frame], others: Sequence[Frame]) -> Iterator[Climb]:
     loop = asyncio.new_event_loop()
     with closing(loop), tempfile.TemporaryDirectory() as data, Store.open(Path(data)) as store:
         tiers = make_tiers(load_settings({"data_dir": data}).settings)
         engine = engine_over(store, tiers, ALL)
         loop.run_until_complete(_store(engine, store, place))
-        for frame in place.queries(OWN):
+        for frame in own:
             yield loop.run_until_complete(_climb(engine, folder, place, frame, is_own=True))
         for frame in others:
             yield loop.run_until_complete(_climb(engine, folder, place, frame, is_own=False))
@@ -98,12 +87,12 @@ async def _climb(engine: QueueEngine, folder: str, place: Place, frame: Frame, i
     photo = Photo(frame.image_path.read_bytes(), frame.camera, "image")
     query = Query(SCENE, (), photo, ANYWHERE, 10, LocalizeOptions())
     result = await engine.run(engine.query_job(query, _caller()))
-    outcome, support, is_right = result.answer.outcome, result.answer.support, False
+    outcome, support, right = result.answer.outcome, result.answer.support, False
     if is_own and isinstance(outcome, Localization):
         off, off_deg = pose_error(frame.world_from_camera, outcome.world_from_camera)
-        largest = RIGHT_SHARE * (getattr(support, "distance_m", float)() or place.radius)
-        is_right = off_deg <= RIGHT_DEG and off <= (min(RIGHT_M, largest) if place.dataset.metric else largest)
-    return Climb(folder, is_own, is_right, result.attempts)
+        distance = getattr(support, "distance_m", float)() or place.radius
+        right = is_right(off, off_deg, distance, place.dataset.metric)
+    return Climb(folder, is_own, right, result.attempts)
 
 
 def _caller() -> Caller:
