@@ -20,7 +20,7 @@ from mapless.deep_pixels import eight_bits
 from mapless.pixels import JPEG_FRAMES, BadHeader, size_of_image
 from mapless_server.errors import InvalidArgument
 
-from .png_chunks import BadChunks, essential_png
+from .png_chunks import essential_png
 
 # IMREAD_UNCHANGED would also ignore the orientation, but keeps alpha. Asked for colour, the decoder drops alpha,
 # repeats grey and converts CMYK.
@@ -98,11 +98,7 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
     if data.startswith(b"\xff\xd8") and _has_many_scans(data):
         raise InvalidArgument("the JPEG has too many scans", reason="IMAGE_TOO_COMPLEX", field=field)
     if data.startswith(_PNG):
-        try:
-            data = essential_png(data)
-        except BadChunks as error:
-            reason = "IMAGE_TOO_COMPLEX" if error.is_too_much else "IMAGE_UNDECODABLE"
-            raise InvalidArgument(str(error), reason=reason, field=field) from None
+        data = essential_png(data, field)
     pixels = _decoded(data)
     if pixels is None and width * height <= _MAX_UNENDED_PIXELS:
         pixels = _decoded_without_end(data)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mapless_server.errors import InvalidArgument
 
 from .decode import ImageLimits, image_size
-from .png_chunks import BadChunks, essential_png, png_chunk_names
+from .png_chunks import essential_png, png_chunk_names
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _DEPTH, _COLOUR = 24, 25
@@ -60,11 +60,7 @@ def decode_mask(
     channels are 0. InvalidArgument as of `check_mask`, or if pixels are transparent, or the file is damaged.
     """
     check_mask(data, size, limits, field)
-    try:
-        essential = essential_png(data)
-    except BadChunks as error:
-        reason = "IMAGE_TOO_COMPLEX" if error.is_too_much else "IMAGE_UNDECODABLE"
-        raise InvalidArgument(str(error).replace("the image", "the mask"), reason=reason, field=field) from None
+    essential = essential_png(data, field, "mask")
     try:
         pixels = cv2.imdecode(np.frombuffer(essential, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:

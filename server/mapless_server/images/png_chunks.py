@@ -9,6 +9,8 @@ import struct
 import zlib
 from collections.abc import Iterable
 
+from mapless_server.errors import InvalidArgument
+
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _ESSENTIAL = frozenset({b"IHDR", b"PLTE", b"IDAT"})
 _END = b"\0\0\0\0IEND\xaeB`\x82"
@@ -21,31 +23,28 @@ _TRUSTED_DATA_BYTES = 2**18
 _PIECE_BYTES = 2**20
 
 
-class BadChunks(Exception):
-    """A PNG is cut off, or has more data than its pixels need (`is_too_much`); the message is for the caller."""
-
-    def __init__(self, message: str, is_too_much: bool) -> None:
-        super().__init__(message)
-        self.is_too_much = is_too_much
-
-
-def essential_png(data: bytes) -> bytes:
+def essential_png(data: bytes, field: str = "image", what: str = "image") -> bytes:
     """The PNG with only header, palette and pixels; the decoder checks their checksums.
 
-    BadChunks if a chunk exceeds the file's end, the end is missing, there are too many chunks, or there are more data
-    than pixels, which would be inflated all the same.
+    InvalidArgument, naming `field` and `what` it is, if a chunk exceeds the file's end, the end is missing, there are
+    too many chunks, or there are more data than pixels, which would be inflated all the same.
     """
+
+    def fault(text: str, reason: str) -> InvalidArgument:
+        return InvalidArgument(text, reason=reason, field=field)
+
+    undecodable = f"the {what} cannot be decoded: the PNG is cut off"
     view = memoryview(data)
     kept: list[memoryview | bytes] = [_SIGNATURE]
     pixel_data: list[memoryview] = []
     position = len(_SIGNATURE)
     for _ in range(_MAX_CHUNKS):
         if position + 12 > len(data):
-            raise BadChunks("the image cannot be decoded: the PNG is cut off", False)
+            raise fault(undecodable, "IMAGE_UNDECODABLE")
         (length,) = struct.unpack_from(">I", data, position)
         kind, end = data[position + 4 : position + 8], position + 12 + length
         if end > len(data):
-            raise BadChunks("the image cannot be decoded: the PNG is cut off or damaged", False)
+            raise fault(f"{undecodable} or damaged", "IMAGE_UNDECODABLE")
         if kind == b"IEND":
             break
         if kind in _ESSENTIAL:
@@ -54,10 +53,10 @@ def essential_png(data: bytes) -> bytes:
             pixel_data.append(view[position + 8 : position + 8 + length])
         position = end
     else:
-        raise BadChunks("the PNG has too many chunks", True)
+        raise fault("the PNG has too many chunks", "IMAGE_TOO_COMPLEX")
     data_bytes, most_bytes = sum(map(len, pixel_data)), _most_data_bytes(data)
     if data_bytes > most_bytes or (data_bytes > _TRUSTED_DATA_BYTES and _inflates_beyond(most_bytes, pixel_data)):
-        raise BadChunks("the PNG has more data than pixels", True)
+        raise fault("the PNG has more data than pixels", "IMAGE_TOO_COMPLEX")
     return b"".join([*kept, _END])
 
 
