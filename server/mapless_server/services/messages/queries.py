@@ -59,14 +59,15 @@ def message_of(value: object, kind: type[MessageT], **others: Any) -> MessageT:
 
     Enums are converted by their names; None leaves a field empty. AttributeError if the value lacks an attribute.
     """
-    given = {it: getattr(value, it.name) for it in kind.DESCRIPTOR.fields if it.name not in others}
+    descriptor: Any = kind.DESCRIPTOR  # annotated as None
+    given = {it: getattr(value, it.name) for it in descriptor.fields if it.name not in others}
     fields = {it.name: _number_of(found, it) if isinstance(found, Enum) else found for it, found in given.items()}
     return kind(**fields, **others)
 
 
 def _number_of(value: Enum, field: FieldDescriptor) -> int:
     values = field.enum_type.values
-    return next(it.number for it in values if it.name == values[0].name.removesuffix("UNSPECIFIED") + value.name)
+    return int(next(it.number for it in values if it.name == values[0].name.removesuffix("UNSPECIFIED") + value.name))
 
 
 def enum_from_message(number: int, enum: wire.ProtoEnum, default: E, field: str) -> E:
