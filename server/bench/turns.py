@@ -26,6 +26,7 @@ from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
 from mapless_tools.evaluate.run import SCENE, store_references
 from mapless_tools.ingest.formats.cameras import read_folder
+from mapless_tools.output_files import markdown_table
 from mapless_tools.usage import UsageError, failures_end_command, usage_errors
 
 TURNS = (0, 1, 1, 0)
@@ -138,17 +139,18 @@ def _processor_s(process_id: int) -> float:
 def report(measured: Sequence[Measured], names: tuple[str, str]) -> list[str]:
     """Lines of the report, in Markdown."""
     lines = [f"{len(measured)} photographs, {names[0]} and {names[1]} by turns (A B B A), medians in ms.", ""]
-    lines += ["| | before | after | ratio | 95 % |", "|---|---|---|---|---|"]
+    rows = []
     for what, times in {
         "processor time": np.array([it.processor_s for it in measured]),
         "time of a call": np.array([it.wall_s for it in measured]),
     }.items():
         a, b = 1e3 * np.median(times, axis=(0, 2))
         ratio, low, high = ratio_with_interval(times.mean(axis=2))
-        lines.append(f"| {what} | {a:.1f} | {b:.1f} | {ratio:.3f} | {low:.3f} to {high:.3f} |")
+        rows.append((what, f"{a:.1f}", f"{b:.1f}", f"{ratio:.3f}", f"{low:.3f} to {high:.3f}"))
     apart = [it.apart_m for it in measured if it.apart_m is not None]
     most = f", at most {max(apart):.2g} (unit of the scene) apart" if apart else ""
-    return [*lines, "", f"Localized by both: {len(apart)}{most}."]
+    table = markdown_table(" | before | after | ratio | 95 %", rows)
+    return [*lines, *table, "", f"Localized by both: {len(apart)}{most}."]
 
 
 def ratio_with_interval(times: Array) -> tuple[float, float, float]:

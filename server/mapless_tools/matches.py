@@ -125,12 +125,12 @@ def draw_matches(
         ends = np.stack([pixels, pixels + drawn], axis=1)
         add_lines(axes, ends[~is_good], color=WRONG, linewidth=1.2 * unit, alpha=0.5)
         add_lines(axes, ends[is_good], color=RESIDUAL, linewidth=1.6 * unit)
-    axes.scatter(*pixels[~is_good].T, marker="x", c=WRONG, s=(6 * unit) ** 2, linewidths=1.5 * unit)
+    axes.scatter(*pixels[~is_good].T, marker="x", c=WRONG, s=(7 * unit) ** 2, linewidths=1.5 * unit)
     style: dict[str, Any] = {"c": GOOD}
     if depth is not None:  # its rank: every step of it is to be seen
         rank = np.argsort(np.argsort(-depth[is_good]))
         style = {"c": rank, "cmap": "turbo", "vmin": -0.18 * len(rank), "vmax": 1.05 * len(rank)}
-    axes.scatter(*pixels[is_good].T, s=(5 * unit) ** 2, linewidths=unit, edgecolors="#06251b", **style)
+    axes.scatter(*pixels[is_good].T, s=(6.5 * unit) ** 2, linewidths=unit, edgecolors="#06251b", **style)
     return factor
 
 

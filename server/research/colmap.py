@@ -31,7 +31,7 @@ from mapless_tools.evaluate.report import SCALE_FREE, format_length, format_rota
 from mapless_tools.evaluate.run import Evaluation
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
-from mapless_tools.output_files import whole_file, write_json
+from mapless_tools.output_files import markdown_table, whole_file, write_json
 
 from .places import KITCHEN, RIGHT_DEG, RIGHT_M, RIGHT_SHARE
 
@@ -282,8 +282,7 @@ def table(cases: Sequence[Case], results: Path, mapless: Path | None) -> Iterato
     systems = ["COLMAP"] if mapless is None else ["COLMAP", "mapless"]
     names = ("localized", "wrong", "median", "s")
     head = ["scene", "references", "queries", *(f"{it}: {name}" for it in systems for name in names)]
-    yield f"| {' | '.join(head)} |"
-    yield "|---" * len(head) + "|"
+    rows = []
     for case in cases:
         file = results / case.file_name
         if not file.is_file():
@@ -295,7 +294,8 @@ def table(cases: Sequence[Case], results: Path, mapless: Path | None) -> Iterato
         if mapless is not None:
             cells += _mapless_texts(mapless / case.file_name, distances)
         references = "leave one out" if case.references is None else str(case.references)
-        yield f"| {' | '.join([case.scene, references, str(colmap['queries']), *cells])} |"
+        rows.append([case.scene, references, str(colmap["queries"]), *cells])
+    yield from markdown_table(" | ".join(head), rows)
 
 
 def _mapless_texts(file: Path, distances: Mapping[str, float]) -> list[str]:

@@ -10,6 +10,7 @@ from pydantic.json_schema import models_json_schema
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
+from mapless_tools.output_files import render
 
 from . import messages
 
@@ -50,11 +51,7 @@ def description() -> dict[str, Any]:
 @cache
 def page() -> str:
     """The page about it."""
-    import jinja2
-
-    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    template = environment.from_string((files(__package__) / "docs.html.j2").read_text("utf-8"))
-    return template.render(description())
+    return render("gateway.html", **description())
 
 
 def _add_message(message: Any, schemas: dict[str, Any]) -> None:
