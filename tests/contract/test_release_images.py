@@ -13,7 +13,7 @@ from typing import cast
 
 import pytest
 import yaml  # type: ignore[import-untyped]
-from support.manifests import needs_kubectl
+from support.manifests import KUBECTL, needs_kubectl
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = ROOT / ".ci" / "images.py"
@@ -105,7 +105,7 @@ def test_every_image_gets_the_digest_of_the_registry(checkout: Path, registry: s
 def test_what_kustomize_makes_is_pinned_with_the_overlays_tag(checkout: Path, registry: str) -> None:
     assert run(checkout, "pin", registry).returncode == 0
     for overlay in ("cpu", "cuda"):
-        command = ["kubectl", "kustomize", str(checkout / "deploy" / "kubernetes" / "overlays" / overlay)]
+        command = [str(KUBECTL), "kustomize", str(checkout / "deploy" / "kubernetes" / "overlays" / overlay)]
         made = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
         (image,) = {
             container["image"]

@@ -1,7 +1,9 @@
 """Kubernetes manifests as kustomize builds them, and the pods in them."""
 
+import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +18,8 @@ Json = dict[str, Any]
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 COMPONENTS = DEPLOY / "kubernetes" / "components"
-needs_kubectl = pytest.mark.skipif(shutil.which("kubectl") is None, reason="kubectl, which has kustomize, is not here")
+KUBECTL = shutil.which("kubectl", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+needs_kubectl = pytest.mark.skipif(KUBECTL is None, reason="kubectl, which has kustomize, is not here")
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ def built(name: str) -> tuple[Json, ...]:
             "components": [str(up / (COMPONENTS / it).relative_to("/")) for it in components],
         }
         (Path(made) / "kustomization.yaml").write_text(yaml.safe_dump(kustomization))
-        command = ["kubectl", "kustomize", made]
+        assert KUBECTL is not None
+        command = [KUBECTL, "kustomize", made]
         text = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
     return tuple(document for document in yaml.safe_load_all(text) if document)
 
