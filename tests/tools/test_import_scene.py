@@ -12,9 +12,11 @@ import pytest
 import mapless_tools.demo
 from mapless import DataLoss, InvalidArgument, Reference
 from mapless.geometry import Similarity, rotation_from_vector
+from mapless_server.method.pairs.readings.alignment import Alignment
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.check import SceneVerdict, check_with_scene
 from mapless_tools.ingest.formats.cameras import read_folder
+from mapless_tools.ingest.report import not_aligned
 
 FRAMES = read_folder(Path(mapless_tools.demo.__file__).parent / "room").frames
 STORED, NEW = FRAMES[0:12:2], FRAMES[1:9:2]
@@ -70,6 +72,12 @@ def test_photographs_of_another_world_are_aligned_with_the_scene() -> None:
         pose = found.alignment.world_from_other.transform_pose(in_session(frame).world_from_camera)
         assert pose.translation == pytest.approx(frame.world_from_camera.translation, abs=0.02)
         assert pose.rotation == pytest.approx(frame.world_from_camera.rotation, abs=0.01)
+
+
+def test_how_well_a_similarity_is_known_is_said() -> None:
+    text = not_aligned(Alignment(WORLD_FROM_SESSION, 1.0, 0.5, 4, 0.2, 0.1, 0.3))
+    assert "50 % of 4 pairs do not fit, the scale is known to 20 %, the rotation to 5.7 degrees" in text
+    assert "the position to 30 % of the extent" in text
 
 
 def test_photographs_that_fit_do_so_beside_damaged_ones() -> None:

@@ -1,5 +1,6 @@
 """The report of an import, for people and for programs."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -112,7 +113,8 @@ def not_aligned(found: Alignment | None) -> str:
     return (
         f"--align-to-scene: the matches do not determine one similarity: {100 * found.bad_share:.0f} % of "
         f"{found.pair_count} pairs do not fit, the scale is known to {100 * found.scale_sigma:.2g} %, the rotation to "
-        f"{found.rotation_sigma_deg:.2g} degrees, the position to {100 * found.position_sigma:.2g} % of the extent"
+        f"{math.degrees(found.rotation_sigma):.2g} degrees, the position to {100 * found.position_sigma:.2g} % of the "
+        "extent"
     )
 
 

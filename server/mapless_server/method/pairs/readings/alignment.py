@@ -29,6 +29,8 @@ MOST_PAIRS = 24
 """Pairs that are used, those with the most matches; every two of them give a solution."""
 AGREEING_DEG = 5.0
 """Between the rotations of two pairs. Relative poses of few matches are off by a degree or two."""
+LEAST_PAIRS = 3
+"""Fewer pairs do not show that a similarity is right: two may agree by chance."""
 MAX_SIGMA = 0.03
 """Largest standard deviations of a unique similarity: of the scale, relative; of the rotation, radians; and of the
 position of the other session's middle, as a share of its extent or, if that is more, of the distance between paired
@@ -80,10 +82,10 @@ class Alignment:
 def align(views: Views, matched: Sequence[MatchedPair]) -> Alignment | None:
     """Finds the similarity from the world of the pairs' second photographs to that of their first ones.
 
-    None if no similarity fits any of them.
+    None if the pairs are too few, or no similarity fits any of them.
     """
     matched = sorted(matched, key=lambda it: -len(it.matches))[:MOST_PAIRS]
-    if not matched:
+    if len(matched) < LEAST_PAIRS:
         return None
     sample = PairSample(views, matched, SAMPLED_MATCHES)
     worlds = _Worlds.of(sample, [it.pair for it in matched])
