@@ -28,7 +28,7 @@ from mapless_server.rpc import Call
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal
 from mapless_server.services.capture import recorder as recorder_module
-from mapless_server.services.capture.calls import decode_call
+from mapless_server.services.capture.calls import decode_call, diagnostics_of
 from mapless_server.services.capture.folder import CaptureFolder, calls_of
 from mapless_server.services.capture.recorder import Recorder
 from mapless_server.settings import load_settings
@@ -72,14 +72,14 @@ def test_what_is_captured_is_marked(tmp_path: Path) -> None:
         stub = LocalizationServiceStub(channel)
         for count, (method, request) in enumerate(asked.items(), 1):
             answer = getattr(stub, method)(request, timeout=LIMIT_S)
-            assert [it.captured for it in recorder_module.diagnostics_of(answer)] in ([True], [True, True])
+            assert [it.captured for it in diagnostics_of(answer)] in ([True], [True, True])
             wait_until(lambda count=count: server.value("mapless_captured_total") == count)  # type: ignore[misc]
             kept = decode_call(calls_of(folder)[-1].read_bytes())
             assert (kept.request, kept.response) == (request.SerializeToString(), answer.SerializeToString())
-            assert kept.request_id == recorder_module.diagnostics_of(answer)[0].request_id
+            assert kept.request_id == diagnostics_of(answer)[0].request_id
             request.options.confidential = True
             answer = getattr(stub, method)(request, timeout=LIMIT_S)
-            assert not any(it.captured for it in recorder_module.diagnostics_of(answer))
+            assert not any(it.captured for it in diagnostics_of(answer))
     assert len(calls_of(folder)) == 3
 
 
