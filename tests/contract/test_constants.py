@@ -56,8 +56,9 @@ def docstring_after(body: list[ast.stmt], i: int) -> str:
     """That of the statement, or of the last one of those without an empty line between them."""
     while i + 1 < len(body) and assigned(body[i + 1]) and body[i + 1].lineno == (body[i].end_lineno or 0) + 1:
         i += 1
-    following = body[i + 1].value if i + 1 < len(body) and isinstance(body[i + 1], ast.Expr) else None
-    return following.value if isinstance(following, ast.Constant) and isinstance(following.value, str) else ""
+    following = body[i + 1] if i + 1 < len(body) else None
+    found = following.value if isinstance(following, ast.Expr) else None
+    return found.value if isinstance(found, ast.Constant) and isinstance(found.value, str) else ""
 
 
 def assigned(statement: ast.stmt) -> tuple[list[str], ast.expr] | None:
@@ -73,8 +74,8 @@ def constants(tree: ast.Module, where: str) -> Iterator[Number]:
     for i, statement in enumerate(tree.body):
         if found := assigned(statement):
             names, value = found
-            is_each = isinstance(value, ast.Tuple) and len(value.elts) == len(names)
-            numbers = [bool(numbers_in(it)) for it in value.elts] if is_each else [True] * len(names)
+            parts = value.elts if isinstance(value, ast.Tuple) else []
+            numbers = [bool(numbers_in(it)) for it in parts] if len(parts) == len(names) else [True] * len(names)
             for name, has_number in zip(names, numbers, strict=True):
                 if has_number:
                     yield Number(f"{where}:{statement.lineno}", name, docstring_after(tree.body, i))

@@ -1,6 +1,6 @@
 """Fairness of the queue: a fleet beside a neighbour without end, clients of one token, tokens that come back."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from statistics import median
 from types import ModuleType
@@ -105,17 +105,17 @@ def _lost(
         yield row | {"p99 beside, worst": f"{worst_s:.2f} s"}
 
 
+def _without_scenes(
+    rows: Callable[[], Iterator[Row]], decide: Callable[[Sequence[Row]], float] | None = None
+) -> Measurement:
+    return Measurement(lambda scenes: rows(), decide, needs_scenes=False)
+
+
+_SHORTER = partial(_lost, expected, "SHORTER", (0.0, 1.0, 1.25, 2.0), (0.33,))
 MEASUREMENTS = {
-    key: Measurement(lambda scenes, rows=rows: rows(), decide, needs_scenes=False)
-    for key, rows, decide in (
-        ("queue-credit", _credit, least("fleet's p95")),
-        ("queue-lately", _lately, least("fleet's p50")),
-        ("queue-failing", partial(_lost, failing, "MEMORY", (1, 2, 4, 8)), None),
-        (
-            "queue-shorter",
-            partial(_lost, expected, "SHORTER", (0.0, 1.0, 1.25, 2.0), (0.33,)),
-            least("p99 beside, worst"),
-        ),
-        ("queue-client-share", _client_share, most("answered beside 4 busy")),
-    )
+    "queue-credit": _without_scenes(_credit, least("fleet's p95")),
+    "queue-lately": _without_scenes(_lately, least("fleet's p50")),
+    "queue-failing": _without_scenes(partial(_lost, failing, "MEMORY", (1, 2, 4, 8))),
+    "queue-shorter": _without_scenes(_SHORTER, least("p99 beside, worst")),
+    "queue-client-share": _without_scenes(_client_share, most("answered beside 4 busy")),
 }
