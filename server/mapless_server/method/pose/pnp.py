@@ -25,7 +25,6 @@ from ..features.views import View
 from ..optim.optimize import pose_hessian, world_covariance
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import PixelPoints, PointMatches, Structure
-from ..structure.observations import MIN_NOISE_LEVEL_PX
 from .with_priors import MIN_INLIERS, informed_pose
 
 SAMPLE, SAMPLE_INLIERS, SAMPLE_ITERATIONS = 80, 32, 300
@@ -40,6 +39,9 @@ REFINEMENT = {"loss_type": "CAUCHY", "loss_scale": LOSS_SCALE_PX}
 
 MAX_LOG10_FALSE_ALARMS = -3.0
 """Largest log10 of the expected number of poses with as many inliers among wrong matches."""
+
+MIN_SIGMA_PX = 0.1
+"""Least standard deviation of keypoints in the covariance of a pose that is not adjusted."""
 
 REFINEMENT_STEPS = 3
 """Levenberg-Marquardt steps of each refinement of a pose from a sample."""
@@ -115,7 +117,7 @@ def _estimate(
         message = f"no pose explains more than {inliers.sum()} of {len(seen)} matches"
         return Rejection(RejectionReason.PNP_FAILED, message)
     # Of half-normal lengths in two dimensions the median is sqrt(2 ln 2) sigma.
-    sigma_px = max(MIN_NOISE_LEVEL_PX, float(np.median(errors_px[inliers])) / np.sqrt(2 * np.log(2)))
+    sigma_px = max(MIN_SIGMA_PX, float(np.median(errors_px[inliers])) / np.sqrt(2 * np.log(2)))
     covariance = world_covariance(pose_hessian(seen.camera, pose, seen.x_in_world[inliers]) / sigma_px**2, pose)
     return PoseEstimate(pose, stage, inliers, errors_px, covariance)
 
