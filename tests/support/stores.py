@@ -87,7 +87,7 @@ class Shared:
     def run_script(self, statements: str) -> None:
         """Executes statements of SQL."""
         with psycopg.connect(self.url) as connection:
-            connection.execute(_in_psycopg(statements))
+            connection.execute(statements.encode())
 
     def inspected(self) -> AbstractContextManager[Connection]:
         """A connection that reflects the schema, which it does not of what is sent in binary."""
