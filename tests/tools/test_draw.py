@@ -110,6 +110,8 @@ class TestPage:
     def test_the_best_references_come_first_after_the_hints(self) -> None:
         used = diagnostics(("a", "b", "c", "d", "e"))
         assert [it[-1] for it in best_references(localized(diagnostics=used))] == ["a", "b", "c"]
+        few = replace(used, references=tuple(replace(it, match_count=0) for it in used.references[:4]))
+        assert best_references(localized(diagnostics=few)) == []
         hint = replace(rejected().hint, best_reference="scenes/hall/references/e")  # type: ignore[type-var]
         assert [it[-1] for it in best_references(rejected(diagnostics=used, hint=hint))] == ["e", "a", "b", "c"]
 
@@ -176,7 +178,7 @@ class TestMatches:
         assert not len(near(picture, WRONG))
 
     def test_names_are_no_formulas(self) -> None:
-        new_axes("a$b$ \\frac", "", "").figure.savefig(Path("/dev/null"), format="svg")
+        new_axes("a$\\frac$", "", "").figure.savefig(Path("/dev/null"), format="svg")
 
 
 class TestPlan:

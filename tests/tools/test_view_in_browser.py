@@ -89,6 +89,7 @@ def look(page: Page, client: Client, folder: Path) -> None:
     page.until(lambda: like(canvas(page), (110, 200, 170), within=40).sum() < 200)
     rows, columns = np.nonzero(like(canvas(page), YELLOW))
     page.until(lambda: opened(page, float(np.median(columns)), TOP_PX + float(np.median(rows))))
+    page.until(lambda: page.evaluate("!!document.querySelector('.mantine-Modal-content iframe')"))
     assert "agree with the pose" in page.evaluate("document.querySelector('.mantine-Modal-content iframe').srcdoc")
     size = page.evaluate(
         "(() => { const it = document.querySelector('.mantine-Modal-content iframe').getBoundingClientRect();"
@@ -103,9 +104,9 @@ def look(page: Page, client: Client, folder: Path) -> None:
 
 
 def opened(page: Page, x: float, y: float) -> bool:
-    """Clicks until the report is open: the first click may come before the frustum is ready for it."""
+    """Clicks until the dialogue is open: the first click may come before the frustum is ready for it."""
     page.click(x, y)
-    return any(page.evaluate("!!document.querySelector('.mantine-Modal-content iframe')") for _ in range(20))
+    return any(page.evaluate("!!document.querySelector('.mantine-Modal-content')") for _ in range(20))
 
 
 def save(page: Page, file: Path) -> None:

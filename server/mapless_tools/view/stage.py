@@ -124,6 +124,13 @@ class Stage:
         if client is None:  # it was closed meanwhile
             return
         query = shown.query
+        with _dialogue(client, query.label) as gui:  # at once: drawing takes a second
+            page = self._page(query)
+            gui.add_html(
+                f'<iframe sandbox srcdoc="{escape(page)}" style="width: 100%; height: 70vh; border: 0"></iframe>'
+            )
+
+    def _page(self, query: Query) -> str:
         known = {f"scenes/{it.scene_id}/references/{it.reference_id}": it for it in self._scenery.references}
         used = {it.name for it in query.answer.diagnostics.references} & known.keys()
         pictured = best_references(query.answer)
@@ -131,11 +138,7 @@ class Stage:
             replace(known[name], image=self._open_photo(known[name].reference_id)) if name in pictured else known[name]
             for name in used
         ]
-        page = answer_page(query.label, query.answer, query.image, query.camera, references, self._scenery.down)
-        with _dialogue(client, query.label) as gui:
-            gui.add_html(
-                f'<iframe sandbox srcdoc="{escape(page)}" style="width: 100%; height: 70vh; border: 0"></iframe>'
-            )
+        return answer_page(query.label, query.answer, query.image, query.camera, references, self._scenery.down)
 
     def _open_reference(self, reference: Reference, client: Any) -> None:
         if client is None:
