@@ -224,23 +224,28 @@ class TestStrongPairs:
 
 
 class TestDamage:
-    def test_a_damaged_pair_is_made_again(self, store: Store, place: Folder) -> None:
+    def test_a_damaged_pair_is_deleted_and_made_again(self, store: Store, place: Folder) -> None:
         server = Server(store, kinds=[Matching.STRICT])
         server.background.match_waiting()
         usual = server.stored()
         place.execute(
             "UPDATE reference_pair SET data = zeroblob(8) WHERE first_key = (SELECT min(first_key) FROM reference_pair)"
         )
-        found = Server(store, kinds=[Matching.STRICT])
+        quick = BackgroundOptions(poll_s=0.01, longest_poll_s=0.02)
+        found = Server(store, quick, kinds=[Matching.STRICT])
         correspondences = found.matcher.correspond(PLANTED.query, found.references())
         assert found.counts.found["damaged"] > 0
         for pair, matches in Matcher().correspond(PLANTED.query, found.references()).reference_pairs.items():
             np.testing.assert_array_equal(correspondences.reference_pairs[pair], matches)
-        found.background.maintain()
-        assert place.fetch("SELECT count(*) FROM reference_pair") == [(len(usual) - found.counts.found["damaged"],)]
-        found.background.match_waiting()
-        assert found.counts.made == found.counts.found["damaged"]
-        again = found.stored()
+        left = len(usual) - found.counts.found["damaged"]
+        found.background.start(makes_pairs=False)
+        wait_until(lambda: place.fetch("SELECT count(*) FROM reference_pair") == [(left,)])
+        found.background.close()
+        assert found.counts.made == 0
+        maker = Server(store, kinds=[Matching.STRICT])
+        maker.background.match_waiting()
+        assert maker.counts.made == found.counts.found["damaged"]
+        again = maker.stored()
         assert again.keys() == usual.keys()
         for names, stored in usual.items():
             np.testing.assert_array_equal(again[names], stored)

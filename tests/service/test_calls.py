@@ -55,6 +55,7 @@ def test_a_full_queue_refuses_with_a_retry_delay(tmp_path: Path, pool: futures.T
         assert refused.reason == "QUEUE_FULL"
         assert refused.retry_after_s is not None
         assert 0 < refused.retry_after_s < 60
+        assert server.value("mapless_admission_rejected_total") == 1
         # The loop is free meanwhile: what needs no thread is answered.
         assert client.is_serving()
         assert client.get_scene(scene).reference_count == 3

@@ -114,9 +114,10 @@ class TestClients:
             monkeypatch.setattr(module, name, getattr(module, name) // 10)
         with serving(tmp_path) as server, Client(server.address) as client, ExitStack() as stack:
             make_scene(client)
+            methods = [f"/grpc.health.v1.Health/{it}" for it in ("Check", "Watch")]
             for _ in range(5):
                 stranger = stack.enter_context(raw_http2.connect(server.address))
-                calls = (raw_http2.begin(stream, "/grpc.health.v1.Health/Check") for stream in range(1, 2 * 100, 2))
+                calls = (raw_http2.begin(stream, methods[stream % 4 == 1]) for stream in range(1, 2 * 100, 2))
                 stranger.sendall(raw_http2.hello() + b"".join(calls))
                 assert is_served(client, "s")
             assert is_served(client, "s")
