@@ -17,6 +17,7 @@ from support.waiting import wait_until
 
 from mapless import (
     Client,
+    ConnectOptions,
     Hypothesis,
     PositionPrior,
     Priors,
@@ -44,7 +45,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Client, st
     flags = {"--capture-dir": str(folder / "calls"), "--features": "sift"}
     with (
         child_server(folder / "data", flags, {"MAPLESS_CAPTURE_HOURS": "1"}) as server,
-        Client(server.address) as client,
+        Client(server.address, ConnectOptions(timeout_s=120)) as client,
     ):
         corner.make_corner(client, [corner.pose(it) for it in ANGLES])
         yield client, server.address, folder
