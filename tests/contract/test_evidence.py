@@ -3,6 +3,7 @@
 import importlib
 import operator
 import re
+from collections.abc import Iterator
 from datetime import date
 from functools import cache
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from research.evidence.__main__ import DATA, KEYS, main, measurement_of
-from research.evidence.page import PAGES, rewritten
+from research.evidence.page import PAGES, Measurement, Row, rewritten
 
 CODE = PAGES.parents[1] / "server"
 STATED = re.compile(r"^`([\w.]+):([\w.]+)` = `([^`]+)`$", re.MULTILINE)
@@ -147,3 +148,29 @@ def test_wrong_usage_ends_with_2_and_leaves_the_page(
     assert ended.value.code == 2
     assert said in capsys.readouterr().err
     assert {it.read_text() for it in pages.iterdir()} == {PAGE}
+
+
+@pytest.mark.parametrize("is_complete", [True, False])
+def test_only_a_complete_table_is_written(
+    is_complete: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / f"{KEYS[0]}.md"
+    page.write_text(PAGE)
+
+    def rows(folder: Path) -> Iterator[Row]:
+        yield {"a": 41}
+        assert page.read_text() == PAGE
+        if not is_complete:
+            raise ValueError("the disk is full")
+
+    monkeypatch.setattr("research.evidence.__main__.PAGES", tmp_path)
+    monkeypatch.setattr("research.evidence.__main__.measurement_of", lambda key: Measurement(rows, needs_scenes=False))
+    monkeypatch.setattr("sys.argv", ["evidence", KEYS[0]])
+    if is_complete:
+        main()
+        assert "| 41 |" in page.read_text()
+    else:
+        with pytest.raises(SystemExit):
+            main()
+        assert page.read_text() == PAGE
+        assert "the disk is full" in capsys.readouterr().err
