@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, resized_pixel
@@ -86,9 +86,9 @@ def show(axes: Axes, picture: Picture) -> None:
     axes.set_axis_off()
 
 
-def rendered(figure: Any) -> Picture:
+def rendered(figure: Figure | SubFigure) -> Picture:
     """The pixels of a figure."""
-    canvas = FigureCanvasAgg(figure)
+    canvas = FigureCanvasAgg(figure.figure if isinstance(figure, SubFigure) else figure)
     canvas.draw()
     return np.array(canvas.buffer_rgba())[..., :3]
 
@@ -125,12 +125,13 @@ def draw_matches(
         ends = np.stack([pixels, pixels + drawn], axis=1)
         add_lines(axes, ends[~is_good], color=WRONG, linewidth=1.2 * unit, alpha=0.5)
         add_lines(axes, ends[is_good], color=RESIDUAL, linewidth=1.6 * unit)
-    axes.scatter(*pixels[~is_good].T, marker="x", c=WRONG, s=(7 * unit) ** 2, linewidths=1.5 * unit)
+    wrong, good = pixels[~is_good], pixels[is_good]
+    axes.scatter(wrong[:, 0], wrong[:, 1], marker="x", c=WRONG, s=(7 * unit) ** 2, linewidths=1.5 * unit)
     style: dict[str, Any] = {"c": GOOD}
     if depth is not None:  # its rank: every step of it is to be seen
         rank = np.argsort(np.argsort(-depth[is_good]))
         style = {"c": rank, "cmap": "turbo", "vmin": -0.18 * len(rank), "vmax": 1.05 * len(rank)}
-    axes.scatter(*pixels[is_good].T, s=(6.5 * unit) ** 2, linewidths=unit, edgecolors="#06251b", **style)
+    axes.scatter(good[:, 0], good[:, 1], s=(6.5 * unit) ** 2, linewidths=unit, edgecolors="#06251b", **style)
     return factor
 
 
@@ -164,7 +165,7 @@ def side_by_side(
     for rows, count, colour, alpha in ((~is_good, MAX_WRONG, WRONG, 0.6), (is_good, MAX_GOOD, GOOD, 0.75)):
         drawn = ends[_some(rows, start[:, 0], count)]
         add_lines(axes, drawn, color=colour, linewidth=0.9, alpha=alpha)
-        axes.scatter(*drawn.reshape(-1, 2).T, c=colour, s=9, linewidths=0.6, edgecolors="#06251b")
+        axes.scatter(drawn[..., 0], drawn[..., 1], c=colour, s=9, linewidths=0.6, edgecolors="#06251b")
     return rendered(axes.figure)
 
 

@@ -81,7 +81,7 @@ def draw_plan(
         around = np.concatenate([around, np.quantile(flat, (0.04, 0.96), axis=0)])
     low, high = around.min(axis=0), around.max(axis=0)
     extent = max(float((high - low).max()), 1e-3)
-    axes.scatter(*flat.T, color=OTHER, s=1.5, linewidths=0, alpha=0.7)
+    axes.scatter(flat[:, 0], flat[:, 1], color=OTHER, s=1.5, linewidths=0, alpha=0.7)
     for group in groups:
         for index, (pose, camera) in enumerate(group.cameras):
             label = "_" if index else group.label

@@ -203,7 +203,7 @@ def test_an_answer_that_was_another_is_shown(captured: Path, tmp_path: Path, mon
     path, call = only(captured, tmp_path, is_named)
     then = pb.LocalizeResponse.FromString(call.response)
     then.localization.world_from_camera.translation_m.x += 0.002
-    planted = replace(call, response=then.SerializeToString(), circumstances=call.circumstances | {"mapless": "0.0.1"})
+    planted = replace(call, response=then.SerializeToString(), circumstances={**call.circumstances, "mapless": "0.0.1"})
     path.write_bytes(encode_call(planted))
     code, report = replay(tmp_path)
     (replayed,) = report["calls"]

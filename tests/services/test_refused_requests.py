@@ -91,7 +91,9 @@ def refusal(method: str, request: Message) -> FieldError | RequestError:
     with pytest.raises((FieldError, RequestError)) as caught:
         asyncio.run(getattr(service, method)(request, call))
     references.close()
-    return caught.value
+    error = caught.value
+    assert isinstance(error, FieldError | RequestError)
+    return error
 
 
 def shifted(y_m: float) -> geometry.RigidTransform:

@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from support.html import Page
 from support.images import encode, textured, with_exif_orientation
 from support.planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
@@ -147,7 +148,7 @@ class TestPage:
 def near(picture: Array, colour: str) -> Array:
     """Where a picture (H, W, 3) has a colour: pixels (N, 2), x first."""
     wanted = np.array([*bytes.fromhex(colour[1:])], float)
-    return np.argwhere(np.abs(picture - wanted).max(axis=2) < 40)[:, ::-1]
+    return np.argwhere(np.abs(picture - wanted).max(axis=2) < 40)[:, ::-1].astype(float)
 
 
 class TestMatches:
@@ -169,16 +170,18 @@ class TestMatches:
         assert not picture[:, round(600 + 0.06 * 800 + 3) :].any()  # its line covers nothing
 
     def test_lines_join_the_pixels_of_two_photographs(self) -> None:
-        black = [Shot(np.zeros((h, w, 3), np.uint8), CAMERA.resized(w, h)) for h, w in ((240, 320), (480, 640))]
-        ends = np.array([[100.0, 60.0]]), np.array([[500.0, 400.0]])
-        picture = side_by_side(*black, *ends, np.array([True]), 240).astype(float)
+        left, right = (Shot(np.zeros((h, w, 3), np.uint8), CAMERA.resized(w, h)) for h, w in ((240, 320), (480, 640)))
+        start, end = np.array([[100.0, 60.0]]), np.array([[500.0, 400.0]])
+        picture = side_by_side(left, right, start, end, np.array([True]), 240).astype(float)
         drawn = near(picture, GOOD)
-        for end in ((100, 60), (320 + 12 + 250, 200)):
-            assert np.abs(drawn - end).sum(axis=1).min() <= 3
+        for at in ((100, 60), (320 + 12 + 250, 200)):
+            assert np.abs(drawn - at).sum(axis=1).min() <= 3
         assert not len(near(picture, WRONG))
 
     def test_names_are_no_formulas(self) -> None:
-        new_axes("a$\\frac$", "", "").figure.savefig(Path("/dev/null"), format="svg")
+        figure = new_axes("a$\\frac$", "", "").figure
+        assert isinstance(figure, Figure)
+        figure.savefig(Path("/dev/null"), format="svg")
 
 
 class TestPlan:

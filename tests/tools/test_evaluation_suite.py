@@ -24,7 +24,7 @@ from mapless_tools.evaluate.benchmarks import BENCHMARKS, DENSE, ScenePlace, fin
 from mapless_tools.evaluate.figures import write_figures
 from mapless_tools.evaluate.metrics import QueryResult
 from mapless_tools.evaluate.page import page
-from mapless_tools.evaluate.pictures import WorstQuery, data_uri, fit_true_poses
+from mapless_tools.evaluate.pictures import WorstQuery, fit_true_poses
 from mapless_tools.evaluate.plan import EvaluationOptions, Method, SuiteOptions, split_scene
 from mapless_tools.evaluate.references import Matcher, PlannedQuery, paired, pairs_file, read_pairs
 from mapless_tools.evaluate.suite import Failure, Journal, Provenance, Run, RunSetup, SceneWork, Suite, measure
@@ -36,6 +36,7 @@ from mapless_tools.evaluate.tables import (
     groups_of,
     tables_of,
 )
+from mapless_tools.matches import data_uri
 from mapless_tools.usage import UsageError
 
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)

@@ -239,7 +239,7 @@ def _row(photo: Photo, width: int, outcome: Outcome, as_json: bool, arguments: a
 def _json(photo: Photo, answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> dict[str, Any]:
     """An answer as JSON values; with --debug, beside what `mapless-server draw` needs to draw it."""
     drawn = {"photo": photo.name, "camera": output.plain(photo.camera)} if arguments.debug else {}
-    return drawn | output.plain(answer)
+    return {**drawn, **output.plain(answer)}
 
 
 def limits(arguments: argparse.Namespace) -> Priors:

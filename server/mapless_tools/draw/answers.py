@@ -79,7 +79,7 @@ def _value(kind: Any, value: Any) -> Any:
         return datetime.fromisoformat(value)
     if kind is float and value is None:
         return float("nan")
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         types = get_type_hints(kind)
         given = {it.name: value[it.name] for it in fields(kind) if it.init and it.name in value}
         return kind(**{name: _value(types[name], it) for name, it in given.items()})

@@ -76,7 +76,8 @@ def outcome_of(response: Any) -> str:
     """The outcome in a word: "localized", or the reason of the rejection."""
     if response.HasField("localization"):
         return "localized"
-    return pb.RejectionReason.Name(response.rejection.reason).removeprefix("REJECTION_REASON_").lower()
+    name: str = pb.RejectionReason.DESCRIPTOR.values_by_number[response.rejection.reason].name
+    return name.removeprefix("REJECTION_REASON_").lower()
 
 
 def _essence(response: Any) -> Any:
