@@ -175,7 +175,7 @@ def _some(rows: NDArray[np.bool_], x: Array, count: int) -> NDArray[np.intp]:
     found = found[np.argsort(x[found], kind="stable")]
     if len(found) <= count:
         return found
-    return found[np.linspace(0, len(found) - 1, count).round().astype(int)]
+    return np.asarray(found[np.linspace(0, len(found) - 1, count).round().astype(int)])
 
 
 def _resized(picture: Picture, width_px: int, height_px: int) -> Picture:

@@ -203,7 +203,9 @@ def test_the_server_takes_its_environment(build: str, monkeypatch: pytest.Monkey
 @each_build
 def test_probes_ask_for_health_and_give_time_to_start(build: str) -> None:
     for pod in servers(build):
-        probes = {it: pod.container.get(it) for it in ("startupProbe", "readinessProbe", "livenessProbe")}
+        probes: dict[str, Any] = {
+            it: pod.container.get(it) for it in ("startupProbe", "readinessProbe", "livenessProbe")
+        }
         if pod.kind == "RayService":  # KubeRay has the others
             probes = {"readinessProbe": probes["readinessProbe"]}
         else:

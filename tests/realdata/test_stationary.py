@@ -7,7 +7,8 @@ import pytest
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.pairs.stationary import StationaryOptions
 from mapless_tools.dataset import Dataset
-from research.evidence.stationary import DRIVE, clean, ignored_share, windows
+from research.evidence.stationary import clean, ignored_share, windows
+from research.places import DRIVE
 
 from .conftest import DATA
 

@@ -1,6 +1,7 @@
-"""Scenes of a folder, those of other places, and turned rasters."""
+"""Scenes of a folder, those of other places, turned rasters, and the list and tables of doubtful photographs."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,6 +11,8 @@ from mapless import Camera, RadialTangential, RigidTransform
 from mapless.geometry import rotation_from_vector
 from mapless_tools.output_files import write_json
 from research.contradictions.cases import quarter_turn
+from research.doubt.cases import doubtful, write_list
+from research.doubt.tables import by, by_angle
 from research.evidence.turning import turned, turned_pixels
 from research.other_places import crossed
 from research.places import Scenes, own_and_other
@@ -94,3 +97,41 @@ def test_a_place_is_asked_with_photographs_of_its_own_and_another(tmp_path: Path
         assert not {it.image_path for it in own} & {it.image_path for it in place.reference_frames}
         assert [name in str(it.image_path) for it in own] == [True, True]
         assert [f"/{other}/" in str(it.image_path) for it in others] == [True]
+
+
+def test_list_names_what_was_expensive_and_is_asked_again(tmp_path: Path) -> None:
+    planted_folder(tmp_path, "shelf")
+    rows = [
+        {"folder": "shelf", "references_stored": 3, "photograph": name, "processor_s": spent_s}
+        for name, spent_s in (("1", 2.5), ("3", 1.5), ("4", 9.0))
+    ]
+    write_list(rows, tmp_path / "list.json")
+    asked = list(doubtful(Scenes(tmp_path), tmp_path / "list.json"))
+    assert [(it.case.name, it.fields["references_stored"]) for it in asked] == [
+        ("1 in shelf-3", 3),
+        ("4 in shelf-3", 3),
+    ]
+    write_list([rows[0] | {"photograph": "gone"}], tmp_path / "list.json")
+    with pytest.raises(ValueError, match="shelf has no photograph gone"):
+        list(doubtful(Scenes(tmp_path), tmp_path / "list.json"))
+
+
+def turned_row(photograph: str, angle_deg: int, outcome: str, processor_s: float) -> dict[str, Any]:
+    return {
+        "folder": "shelf",
+        "photograph": photograph,
+        "angle_deg": angle_deg,
+        "outcome": outcome,
+        "processor_s": processor_s,
+        "attempts": [{}],
+    }
+
+
+def test_turned_photographs_are_compared_with_themselves_upright() -> None:
+    rows = [turned_row("a", 0, "right", 0.5), turned_row("b", 0, "LOW_OVERLAP", 9.0), turned_row("c", 0, "right", 1.0)]
+    rows += [turned_row("a", 90, "right", 1.0), turned_row("b", 90, "right", 1.0), turned_row("c", 90, "wrong", 4.0)]
+    assert by_angle(rows)[2:] == [
+        "| 0 | 2 | 2 (100 %) | 0 | 0 | 0.75 | 0.97 | 1.00 | 1.00 |",
+        "| 90 | 2 | 1 (50 %) | 1 | 0 | 2.50 | 3.85 | 3.00 | 3.33 |",
+    ]
+    assert by("degrees", lambda row: row["angle_deg"], rows)[-1] == "| all | 6 | 4 | 1 | 1 | 1.00 | 7.75 | 1.0 |"

@@ -76,8 +76,8 @@ def outcome_of(response: Any) -> str:
     """The outcome in a word: "localized", or the reason of the rejection."""
     if response.HasField("localization"):
         return "localized"
-    name: str = pb.RejectionReason.DESCRIPTOR.values_by_number[response.rejection.reason].name
-    return name.removeprefix("REJECTION_REASON_").lower()
+    reasons = response.rejection.DESCRIPTOR.fields_by_name["reason"].enum_type.values_by_number
+    return str(reasons[response.rejection.reason].name).removeprefix("REJECTION_REASON_").lower()
 
 
 def _essence(response: Any) -> Any:

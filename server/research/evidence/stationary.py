@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -251,7 +252,10 @@ def clean(folder: Path, name: str, extractor: FeatureExtractor) -> list[PosedVie
     return found
 
 
-_ALTERNATIVES = {"contradicted_px": (1.0, 2.0, 3.0, 4.0, 6.0, 8.0), "support": (1, 2, 3, 5, 10)}
+_ALTERNATIVES: dict[str, Sequence[Any]] = {
+    "contradicted_px": (1.0, 2.0, 3.0, 4.0, 6.0, 8.0),
+    "support": (1, 2, 3, 5, 10),
+}
 
 
 def _extractors() -> dict[str, FeatureExtractor]:

@@ -9,10 +9,11 @@ import numpy as np
 from mapless import Camera, Client, NewReference, Rejected, RigidTransform
 from mapless_tools.child import temporary_server
 from mapless_tools.evaluate.metrics import pose_error
+from research.places import RIGHT_M
 
 from .overlays import OVERLAYS, Image, Overlay
 from .page import Measurement, Row
-from .stationary import RIGHT_M, Scene, scenes_in
+from .stationary import Scene, scenes_in
 
 OTHERS, RIGHT = 4, 3
 """Photographs of other places, and of the place itself, for each scene and overlay."""
