@@ -230,6 +230,7 @@ BAD: dict[str, list[Case]] = {
         ("scene.datum.enu_from_world", geometry.Quaternion(w=NAN)),
         ("scene.down_in_world.z", 0.0, "scene.down_in_world"),
         ("scene.down_in_world.x", NAN, "scene.down_in_world"),
+        ("scene.calibration.variant", pb.VARIANT_UNSPECIFIED),
         ("scene.calibration.variant", 99),
         ("scene.calibration.position_factor_68", 0),
         ("scene.calibration.position_factor_95", NAN),

@@ -335,9 +335,11 @@ class TestFullDisk:
         with place.open() as store:
             fill(store, OFFICE)
             with monkeypatch.context() as patch:
-                self.fill_up(patch, 0)
+                tried = self.fill_up(patch, 0)
                 with pytest.raises(errors.Overloaded):
                     store.delete_scene(OFFICE)
+                begun = len(tried)
+                wait_until(lambda: len(tried) > 3 * begun)  # the thread goes on where there is still none
             wait_until(lambda: row_counts(place) == EMPTY)
 
     def test_what_is_left_is_tried_again_by_one_thread_until_it_is_closed(self, tmp_path: Path) -> None:
