@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from support.clients import Played
 
 from mapless import wire
-from mapless.calls import localization, references
+from mapless.calls import localization, references, repeats
 from mapless.connection import Connection
 from mapless.errors import AlreadyExists, Internal, NotFound, Unavailable
 from mapless.geodesy import Datum
@@ -146,6 +146,19 @@ def test_a_different_reference_of_the_same_name_is_named(what: str) -> None:
     assert isinstance(error, AlreadyExists)
     assert error.resource == "scenes/a/references/r02"
     assert error.message == f"reference 'r02' exists already, with another {what}"
+
+
+def test_a_single_reference_that_differs_is_not_ours() -> None:
+    (wanted,) = requests(1)
+    there = pb.GetReferenceResponse(reference=stored(wanted))
+
+    def looked_up(outcome: object) -> Any:
+        return Played(lambda it: repeats.stored_reference(wanted, it, TAKEN), [outcome], ConnectOptions()).result
+
+    assert looked_up(there).reference_id == "r00"
+    assert looked_up(ABSENT) is TAKEN
+    there.reference.world_from_camera.translation_m.x += 0.001
+    assert looked_up(there) is TAKEN
 
 
 def test_a_taken_name_that_is_not_listed_is_an_error() -> None:
