@@ -108,7 +108,7 @@ def test_backups_of_earlier_releases_are_restored(place: Place, release: str, tm
     ("version", "advice"),
     [
         (SCHEMA_VERSION + 1, f"newer release.*version {SCHEMA_VERSION + 1}.*up to {SCHEMA_VERSION}; use that release"),
-        (2, "version 2, .*before release 0.2.0.*`mapless-server store migrate` of release 0.3.0"),
+        (2, "version 2, .*before release 0.2.0.*`mapless-server store migrate` of release 0.3.0.*a backup, restore it"),
         (5, "version 5, .*between releases.*`mapless-server store migrate` of release 0.3.0"),
     ],
 )

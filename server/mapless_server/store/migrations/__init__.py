@@ -49,7 +49,8 @@ def read_version(connection: Connection) -> int | None:
     if found < FIRST_STEP and found != OLDEST_VERSION:
         raise ValueError(
             f"its schema has version {found}, which lies before release 0.2.0 or between releases; run "
-            "`mapless-server store migrate` of release 0.3.0 first"
+            "`mapless-server store migrate` of release 0.3.0 first; if it is a backup, restore it with release 0.3.0, "
+            "and back it up there again"
         )
     return found
 
