@@ -20,7 +20,7 @@ Row = dict[str, Any]
 
 ROOT = Path(__file__).resolve().parents[2]
 FIGURES = ROOT / "docs/results"
-"""A file for each table: machine, command and rows, each of which has the commit and the date of its measurement."""
+"""A file for each table: machine, command (as Markdown), and rows, each with the commit and date of its measurement."""
 
 PAGES = (ROOT / "docs/results.md", ROOT / "README.md")
 DIGITS = {"cm": ".2f", "%": ".3f", "units": ".4g"}
@@ -65,7 +65,7 @@ def table(name: str) -> str:
     head, *rows = make(figures["rows"])
     measured = sorted({(row["commit"], row["date"]) for row in figures["rows"] if row.get("method") != "colmap"})
     commits = ", ".join(f"{commit} ({date})" for commit, date in measured)
-    line = f"Measured by `{figures['command']}`; commits {commits}; {figures['machine']}."
+    line = f"Measured by {figures['command']}; commits {commits}; {figures['machine']}."
     lines = markdown_table(" | ".join(head), rows)
     return "\n".join(lines if name.endswith("_short") else [*lines, "", line])
 
