@@ -4,6 +4,7 @@ import os
 import shutil
 import stat
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -100,22 +101,82 @@ def test_a_call_ahead_of_the_clock_is_deleted(tmp_path: Path) -> None:
     folder.close()
 
 
+def test_calls_expire_although_the_clock_is_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Back: what has passed counts, also of calls found at the start. Ahead: the clock does."""
+    clock, passed_s = Clock(), [0.0]
+    monkeypatch.setattr(folder_module, "time", SimpleNamespace(monotonic=lambda: passed_s[0]))
+    folder = opened(tmp_path / "c", 100.0, clock=clock)
+    for ahead_s in (0, 5):
+        folder.add(a_call(0, NOW_S + ahead_s))
+    clock.now_s -= 50
+    for passed_s[0] in (40.0, 80.0, 99.0):  # the folder is read anew meanwhile
+        assert (folder.tidy(), len(files(tmp_path / "c"))) == (min(30.0, 100 - passed_s[0]), 2)
+    passed_s[0] = 100.0
+    assert (folder.tidy(), files(tmp_path / "c")) == (30.0, [])
+    folder.add(a_call(1, clock.now_s))
+    clock.now_s += 80
+    assert (folder.tidy(), len(files(tmp_path / "c"))) == (20.0, 1)
+    folder.close()
+    folder = opened(tmp_path / "c", 100.0, clock=clock)
+    clock.now_s -= 80
+    passed_s[0] += 19.0
+    assert (folder.tidy(), len(files(tmp_path / "c"))) == (1.0, 1)
+    passed_s[0] += 1.0
+    assert (folder.tidy(), files(tmp_path / "c")) == (30.0, [])
+    folder.add(a_call(2, clock.now_s))
+    clock.now_s += 100
+    assert (folder.tidy(), files(tmp_path / "c")) == (30.0, [])
+    folder.close()
+
+
 def test_what_version_0_3_left_is_deleted_in_time(tmp_path: Path) -> None:
-    """Copies of references beside its calls, and its mark; a file of the operator is never touched."""
+    """Copies of references beside its calls, and parts of them; a file of the operator is never touched."""
     clock = Clock()
     (call,) = filled(tmp_path / "c")
-    copy = tmp_path / "c" / "tenants" / "acme" / "blobs" / f"{7:064x}"
-    copy.parent.mkdir()
-    for path in (copy, tmp_path / "c" / "notes.txt", copy.with_name("notes.txt"), call.with_name("notes.txt")):
+    copies = tmp_path / "c" / "tenants" / "acme" / "blobs"
+    copies.mkdir()
+    copy, half = copies / f"{7:064x}", copies / f"{8:064x}.tmp"
+    theirs = [
+        tmp_path / "c" / "notes.txt",
+        call.with_name("notes.txt"),
+        *(copies / it for it in ("notes.txt", "z" * 64, f"{7:064X}.txt", f"{7:064x}.jpg", f"{7:065x}")),
+    ]
+    for path in (copy, half, *theirs):
         path.write_bytes(b"x" * 5000)
-    (tmp_path / "c" / "mapless-capture.json").write_text('{"format": 1}')
-    os.utime(copy, (NOW_S - 50, NOW_S - 50))
+        os.utime(path, (NOW_S - 50, NOW_S - 50))
     folder = opened(tmp_path / "c", 100.0, clock=clock)
+    assert not half.exists()
     assert folder.disk_bytes == 4096 + 8192
     clock.now_s += 51
     folder.tidy()
-    assert (call.exists(), copy.exists(), len(files(tmp_path / "c"))) == (True, False, 1 + 3 + 1)
+    assert files(tmp_path / "c") == sorted([call, *theirs])
     folder.close()
+
+
+@pytest.mark.parametrize(
+    "left", ["by 0.3", "without a marker", "by a kill", "by a power failure", "nothing but a lock"]
+)
+def test_a_folder_that_servers_left_is_opened(tmp_path: Path, left: str) -> None:
+    """And its limits hold again."""
+    path = tmp_path / "c"
+    filled(path)
+    (path / "tenants" / "acme" / "blobs").mkdir()
+    (path / "tenants" / "acme" / "blobs" / f"{7:064x}").write_bytes(b"")
+    if left == "by 0.3":
+        (path / "notes.txt").touch()
+    else:
+        (path / "mapless-capture.json").unlink()
+    if left == "by a kill":
+        (path / "mapless-capture.json.tmp").write_text('{"for')
+    if left == "by a power failure":
+        (path / "mapless-capture.json").touch()
+    if left == "nothing but a lock":
+        shutil.rmtree(path / "tenants")
+    clock = Clock()
+    clock.now_s += 1e9
+    opened(path, clock=clock).close()
+    assert [it.name for it in files(path)] == (["notes.txt"] if left == "by 0.3" else [])
+    assert (path / "mapless-capture.json").read_text() == '{"format": 1}'
 
 
 def test_what_a_killed_server_left_is_deleted_at_the_start(tmp_path: Path) -> None:
@@ -209,26 +270,111 @@ def test_a_folder_that_cannot_be_read_is_rejected(tmp_path: Path, monkeypatch: p
         select(tmp_path / "c", Selection(), [])
 
 
-def test_what_is_behind_a_link_is_deleted_in_time(tmp_path: Path) -> None:
-    """As on another disk: what is written there is found again."""
-    filled(tmp_path / "c")
-    tenant = tmp_path / "c" / "tenants" / "acme"
-    tenant.rename(tmp_path / "elsewhere")
-    tenant.symlink_to(tmp_path / "elsewhere")
+@pytest.mark.parametrize("place", ["tenants", "tenants/acme", "tenants/acme/calls", "tenants/acme/calls/hall"])
+@pytest.mark.parametrize("marked", [True, False])
+def test_a_folder_with_a_link_is_rejected(tmp_path: Path, place: str, marked: bool) -> None:
+    """What is behind the link is neither read nor deleted."""
+    path = tmp_path / "c"
+    filled(path)
+    if not marked:
+        (path / "mapless-capture.json").unlink()
+    (path / place).rename(tmp_path / "elsewhere")
+    (path / place).symlink_to(tmp_path / "elsewhere")
     clock = Clock()
     clock.now_s += 5000
+    with pytest.raises(CaptureError, match=rf"cannot be used: .*{place}: a symbolic link"):
+        opened(path, clock=clock)
+    with pytest.raises(CaptureError, match=rf"{place} cannot be read: a symbolic link"):
+        select(path, Selection(), [])
+    assert len(files(tmp_path / "elsewhere")) == 1
+
+
+@pytest.mark.parametrize("place", ["tenants", "tenants/acme", "tenants/acme/calls", "tenants/acme/calls/hall"])
+def test_nothing_is_written_or_deleted_through_a_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, place: str
+) -> None:
+    """That is made while the server runs."""
+    monkeypatch.setattr(folder_module, "SCAN_S", 0.0)
+    path, clock = tmp_path / "c", Clock()
+    folder = opened(path, clock=clock)
+    folder.add(a_call())
+    (path / place).rename(tmp_path / "elsewhere")
+    (path / place).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="a symbolic link"):
+        folder.add(a_call(1))
+    clock.now_s += 5000
+    folder.tidy()
+    assert len(files(tmp_path / "elsewhere")) == 1
+    assert f"{path / place} cannot be read: a symbolic link" in caplog.text
+    (path / place).unlink()
+    folder.tidy()
+    assert folder.add(a_call(2, clock.now_s))
+    folder.close()
+
+
+def test_links_in_place_of_files_and_deeper_are_left_alone(tmp_path: Path) -> None:
+    (call,) = filled(tmp_path / "c")
+    (tmp_path / "c" / "tenants" / "acme" / "blobs").mkdir()
+    theirs = tmp_path / "elsewhere"
+    (theirs / "hall").mkdir(parents=True)
+    (theirs / call.name).write_bytes(b"")
+    (theirs / "hall" / call.name).write_bytes(b"")
+    links = [
+        call.with_name("1-1.call"),
+        call.with_name("1-2.call.tmp"),
+        tmp_path / "c" / "tenants" / "acme" / "blobs" / f"{7:064x}",
+        tmp_path / "c" / "tenants" / "acme" / "notes",
+    ]
+    for link in links:
+        link.symlink_to(theirs / call.name)
+    call.with_name("deeper").symlink_to(theirs)
+    (call.parent / "deep" / "hall").mkdir(parents=True)
+    (call.parent / "deep" / "hall" / call.name).write_bytes(b"")
+    clock = Clock()
+    clock.now_s += 1e9
     opened(tmp_path / "c", clock=clock).close()
-    assert files(tmp_path / "elsewhere") == []
+    assert (call.exists(), len(files(theirs)), [it.is_symlink() for it in links]) == (False, 2, [True] * 4)
+    assert (call.parent / "deep" / "hall" / call.name).exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "thesis.tex",
+        "tenants/thesis.tex",
+        "tenants/acme/config.yaml",
+        "tenants/acme/calls/hall/notes.txt",
+        "tenants/acme/blobs/notes.txt",
+        "tenants/acme/calls/hall/deeper/1-1.call",
+    ],
+)
+@pytest.mark.parametrize("beside", ["nothing", "lock", "a call"])
+def test_a_folder_of_others_is_left_as_it_was(tmp_path: Path, name: str, beside: str) -> None:
+    path = tmp_path / "c"
+    (path / name).parent.mkdir(parents=True)
+    (path / name).write_text("years of work")
+    if beside == "lock":
+        (path / "lock").touch()
+    if beside == "a call":
+        (path / "tenants" / "a" / "calls" / "b").mkdir(parents=True)
+        (path / "tenants" / "a" / "calls" / "b" / "1-1.call").touch()
+    path.chmod(0o755)
+    before = sorted(path.rglob("*"))
+    with pytest.raises(CaptureError, match="holds something else"):
+        opened(path)
+    assert sorted(path.rglob("*")) == before
+    assert stat.S_IMODE(path.stat().st_mode) == 0o755
 
 
 def test_folders_that_cannot_be_used_are_rejected(tmp_path: Path) -> None:
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.tex").write_text("years of work")
-    with pytest.raises(CaptureError, match="holds something else"):
-        opened(tmp_path / "full")
     (tmp_path / "file").write_text("")
     with pytest.raises(CaptureError, match="cannot be used"):
         opened(tmp_path / "file")
+    filled(tmp_path / "c")
+    shutil.rmtree(tmp_path / "c" / "tenants")
+    (tmp_path / "c" / "tenants").touch()
+    with pytest.raises(CaptureError, match="tenants: Not a directory"):
+        opened(tmp_path / "c")
 
 
 @pytest.mark.parametrize(("capture", "data"), [("d/c", "d"), ("d", "d"), ("d", "d/c"), ("d/../d/c", "d")])

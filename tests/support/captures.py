@@ -6,7 +6,7 @@ import numpy as np
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.services.capture.calls import CapturedCall, CapturedPart
-from mapless_server.services.capture.folder import CaptureFolder
+from mapless_server.services.capture.folder import LOCK_FILE, MARKER_FILE, CaptureFolder
 
 NOW_S = 1_800_000_000.0
 POSE = RigidTransform(rotation_from_vector([0.1, 0.2, 0.3]), np.array([1 / 3, 2e6, -0.1]))
@@ -19,7 +19,7 @@ def a_call(number: int = 0, time_s: float = NOW_S, size: int = 1000) -> Captured
 
 
 def files(folder: Path) -> list[Path]:
-    return sorted(it for it in folder.rglob("*") if it.is_file() and it.name != "lock")
+    return sorted(it for it in folder.rglob("*") if it.is_file() and it.name not in (LOCK_FILE, MARKER_FILE))
 
 
 class Clock:

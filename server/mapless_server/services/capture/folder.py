@@ -1,21 +1,26 @@
 """The folder of captured calls, with a limit of age and one of size; readable by its owner alone.
 
+    mapless-capture.json            marks the folder as one of captured calls
     lock                            held by the server that writes
     tenants/{tenant}/calls/{scene}/{milliseconds}-{random}.call
 
-A call's age is that of its name: what a file says, whether it is damaged, or when it was copied cannot prolong it. A
-call that is ahead of the clock, which was set back since, has an unknown age, and is deleted. What version 0.3 left
-beside its calls (`tenants/{tenant}/blobs/`) is limited in the same way, by the times of its files.
+A call's age is that of its name: what a file says, whether it is damaged, or when it was copied cannot prolong it. Nor
+can setting the clock: a call also expires when its time has passed since it was written or found, by a clock that is
+never set, and one that is more than a minute ahead of the clock has an unknown age, and is deleted. What version 0.3
+left beside its calls (`tenants/{tenant}/blobs/`) is limited in the same way, by the times of its files.
+
+Nothing outside the folder is read, written or deleted: a symbolic link in place of one of these folders is an error.
 """
 
 import errno
 import fcntl
 import logging
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from uuid import uuid4
 
@@ -23,6 +28,7 @@ from .calls import CapturedCall, CaptureError, encode_call
 
 log = logging.getLogger(__name__)
 
+MARKER_FILE = "mapless-capture.json"
 LOCK_FILE = "lock"
 TENANTS = "tenants"
 CALL_SUFFIX = ".call"
@@ -33,13 +39,19 @@ SCAN_S = 30.0
 _FUTURE_S = 60.0
 """A call that is further ahead of the clock than this was captured while the clock was wrong."""
 _MIN_PAUSE_S = 0.01
+_CALL_NAME = re.compile(r".*\.call(\.tmp)?")
+_COPY_NAME = re.compile(r"[0-9a-f]{64}(\.tmp)?")
+"""A copy of a reference that version 0.3 made."""
 _BLOCK_BYTES = 4096
 """File systems allocate in blocks of this size."""
 
 
 @dataclass(frozen=True)
 class _File:
+    """When it was written by the clock, Unix seconds, and when it expires by `time.monotonic`."""
+
     time_s: float
+    deadline_s: float
     disk_bytes: int
 
 
@@ -97,8 +109,9 @@ class CaptureFolder:
         self._make_room(disk_bytes)
         name = f"{round(1e3 * call.time_s):014d}-{uuid4().hex}{CALL_SUFFIX}"
         path = self.path / TENANTS / call.tenant / "calls" / call.scene_id / name
+        self._refuse_links(path)
         _write_whole(path, data)
-        self._files[path] = _File(call.time_s, disk_bytes)
+        self._files[path] = self._file(call.time_s, disk_bytes)
         self.disk_bytes += disk_bytes
         return True
 
@@ -112,16 +125,27 @@ class CaptureFolder:
                 self._scan()
             except OSError as error:
                 log.error("captured calls in %s cannot be read: %s", error.filename or self.path, error.strerror)
-        now_s = self._clock()
+        now_s, monotonic_s = self._clock(), time.monotonic()
+
+        def left_s(file: _File) -> float:
+            return min(file.time_s + self._keep_s - now_s, file.deadline_s - monotonic_s)
+
         for path, file in list(self._files.items()):
-            if not now_s - self._keep_s < file.time_s <= now_s + _FUTURE_S:
+            if left_s(file) <= 0 or file.time_s > now_s + _FUTURE_S:
                 self._remove(path)
-        left = [it.time_s + self._keep_s - now_s for it in self._files.values()]
+        left = map(left_s, self._files.values())
         return min([SCAN_S, *(max(it, _MIN_PAUSE_S) for it in left if it > 0)])
+
+    def _file(self, time_s: float, disk_bytes: int) -> _File:
+        """A file that is seen for the first time now."""
+        left_s = min(time_s + self._keep_s - self._clock(), self._keep_s)
+        return _File(time_s, time.monotonic() + left_s, disk_bytes)
 
     def _scan(self) -> None:
         self._scanned_s = time.monotonic()
-        found = {path: _File(*_time_and_size(path)) for path in _files_of(self.path)}
+        found = {path: self._file(*_time_and_size(path)) for path in _files_of(self.path)}
+        for path in found.keys() & self._files.keys():  # seen before
+            found[path] = replace(found[path], deadline_s=self._files[path].deadline_s)
         self._files = dict(sorted(found.items(), key=lambda it: it[1].time_s))
         self.disk_bytes = sum(it.disk_bytes for it in found.values())
 
@@ -136,6 +160,7 @@ class CaptureFolder:
 
     def _remove(self, path: Path) -> None:
         try:
+            self._refuse_links(path)
             path.unlink(missing_ok=True)
         except OSError as error:
             log.error("captured call %s cannot be deleted: %s", path, error)
@@ -144,22 +169,31 @@ class CaptureFolder:
         with suppress(OSError):  # other calls are in it
             path.parent.rmdir()
 
+    def _refuse_links(self, path: Path) -> None:
+        """OSError if a symbolic link stands in place of a folder on the way to a file; the folder itself may be one."""
+        for place in path.parents:
+            if place == self.path:
+                return
+            _refuse_link(place)
+
     def _open(self) -> None:
-        """Creates the folder if it does not exist, and locks it."""
+        """Creates the folder if it does not exist, locks and marks it; what is not ours is left as it was."""
         self.close()
         self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        names = {it.name for it in self.path.iterdir()}
-        if TENANTS not in names and names - {LOCK_FILE, "mapless-capture.json"}:  # a file of version 0.3
+        is_marked = _is_marked(self.path)
+        if not is_marked and _is_foreign(self.path):
             raise CaptureError(f"capture folder {self.path} holds something else; name an empty or a new one")
         if self.path.stat().st_mode & 0o077:
             self.path.chmod(0o700)
-        self._lock = os.open(self.path / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o600)
+        self._lock = os.open(self.path / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.close()
             message = f"capture folder {self.path} is in use by another server; each needs one of its own"
             raise CaptureError(message) from None
+        if not is_marked:
+            _write_whole(self.path / MARKER_FILE, b'{"format": 1}')
 
     def _is_locked(self) -> bool:
         """Whether our lock is that of the folder, not of one that was deleted by hand."""
@@ -182,20 +216,60 @@ def _time_and_size(path: Path) -> tuple[float, int]:
     return 0.0 if path.suffix == UNFINISHED_SUFFIX else time_s, _disk_bytes(status.st_size)
 
 
+def _refuse_link(place: Path) -> None:
+    if place.is_symlink():
+        raise OSError(errno.ELOOP, "a symbolic link stands in place of a folder", str(place))
+
+
 def _files_of(folder: Path) -> Iterator[Path]:
-    """Yields the files that servers have written, none of others; OSError if a folder cannot be read."""
+    """Yields the files that servers have written, none of others; OSError if a folder is a link or cannot be read."""
+    for tenant in _folders_in(folder / TENANTS):
+        for place in _folders_in(tenant):
+            match place.name:
+                case "calls":
+                    for scene in _folders_in(place):
+                        yield from _files_in(scene, _CALL_NAME)
+                case "blobs":
+                    yield from _files_in(place, _COPY_NAME)
+
+
+def _folders_in(place: Path) -> Iterator[Path]:
+    return (Path(it) for it in _entries(place) if it.is_symlink() or it.is_dir())
+
+
+def _files_in(place: Path, name: re.Pattern[str]) -> Iterator[Path]:
+    return (Path(it) for it in _entries(place) if it.is_file(follow_symlinks=False) and name.fullmatch(it.name))
+
+
+def _entries(place: Path) -> list[os.DirEntry[str]]:
+    """Entries of a folder; none if it does not exist."""
+    _refuse_link(place)
+    try:
+        with os.scandir(place) as entries:
+            return list(entries)
+    except FileNotFoundError:
+        return []
+
+
+def _is_marked(folder: Path) -> bool:
+    """Whether a server has marked the folder; a marker may be empty after a power failure."""
+    marker = folder / MARKER_FILE
+    return marker.is_file() and marker.stat().st_size > 0
+
+
+def _is_foreign(folder: Path) -> bool:
+    """Whether a folder holds anything that no server has written; OSError if a part of it cannot be read."""
+    names = {it.name for it in folder.iterdir()}
+    if names - {MARKER_FILE, MARKER_FILE + UNFINISHED_SUFFIX, LOCK_FILE, TENANTS}:
+        return True
+    ours = set(_files_of(folder))
 
     def fail(error: OSError) -> None:
-        if not isinstance(error, FileNotFoundError):
-            raise error
+        raise error
 
-    for place, _, names in os.walk(folder / TENANTS, onerror=fail, followlinks=True):
-        match Path(place).relative_to(folder / TENANTS).parts:
-            case (_, "calls", _):
-                suffixes = (CALL_SUFFIX, CALL_SUFFIX + UNFINISHED_SUFFIX)
-                yield from (Path(place, it) for it in names if it.endswith(suffixes))
-            case (_, "blobs"):
-                yield from (Path(place, it) for it in names if len(it.partition(".")[0]) == 64)
+    walk = os.walk(folder / TENANTS, onerror=fail) if TENANTS in names else ()
+    found = (Path(place, it) for place, folders, files in walk for it in (*folders, *files))
+    return any(it not in ours and (it.is_symlink() or not it.is_dir()) for it in found)
 
 
 def _write_whole(path: Path, data: bytes) -> None:
