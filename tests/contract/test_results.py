@@ -45,7 +45,7 @@ def test_figures_have_machine_commit_and_date(file: Path) -> None:
 
 def test_new_figures_replace_those_of_the_same_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(results, "FIGURES", tmp_path)
-    results.write(tmp_path / "accuracy.json", {"command": "make bench", "machine": "one", "rows": []})
+    results.write(tmp_path / "accuracy.json", {"command": "`make bench`", "machine": "one", "rows": []})
     other = SCENE | {"metric": False, "split": "leave_one_out", "scene": "fox", "features": "sift-2048"}
     measured = {"quick": False, "scenes": [SCENE], "others": [other], "latency": None}
     for commit in ("00000000", "11111111"):
