@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +14,11 @@ from matplotlib.figure import Figure
 from support.html import Page
 from support.images import encode, textured, with_exif_orientation
 from support.planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from mapless.answers import Hint, Hypothesis, LocalizationResult, Rejected
 from mapless.cli.output import plain
+from mapless.diagnostics import Debug
 from mapless.geometry import Array
 from mapless.results import Reference
 from mapless_tools.charts import new_axes
@@ -207,8 +209,17 @@ class TestPlan:
         assert ((along / radii) ** 2).sum(axis=1).__le__(1).mean() == pytest.approx(0.95, abs=0.004)
 
 
-def written(answer: LocalizationResult | Rejected) -> str:
-    return json.dumps({"photo": "a.jpg", "camera": plain(CAMERA)} | plain(answer))
+NO_MATCHES = Debug(
+    np.empty((0, 2)), np.empty((0, 3)), np.empty(0, bool), np.empty(0), np.empty(0, np.intp), np.empty((0, 2))
+)
+HINT = Hint("pnp", "LOOK_AT_REFERENCE", "Point the camera there.", "scenes/hall/references/a")
+OUTSIDE = ("/etc/hostname", "../x.jpg", "b/../../x.jpg", "..", "")
+UNKNOWN = rejected(hint=None, diagnostics=diagnostics(()), debug=NO_MATCHES)
+"""A rejection without references, which needs no server."""
+
+
+def written(answer: LocalizationResult | Rejected, photo: str = "a.jpg") -> str:
+    return json.dumps({"photo": photo, "camera": plain(CAMERA)} | plain(answer))
 
 
 def rounded(answer: LocalizationResult | Rejected) -> object:
@@ -216,7 +227,9 @@ def rounded(answer: LocalizationResult | Rejected) -> object:
 
 
 class TestAnswers:
-    @pytest.mark.parametrize("answer", [localized(), localized(debug=None, covariance=None), rejected(), AMBIGUOUS])
+    @pytest.mark.parametrize(
+        "answer", [localized(), localized(debug=None, covariance=None), rejected(), AMBIGUOUS, UNKNOWN]
+    )
     def test_an_answer_is_read_as_it_was_written(self, answer: LocalizationResult | Rejected) -> None:
         text = written(answer)
         failed = json.dumps({"photo": "b.jpg", "error": {"code": "INTERNAL"}})
@@ -226,6 +239,12 @@ class TestAnswers:
             assert rounded(found.answer) == rounded(answer)
             assert str(found.answer) == str(answer)
             assert found.camera == CAMERA
+
+    @pytest.mark.parametrize("answer", [localized(debug=NO_MATCHES), rejected(debug=NO_MATCHES)])
+    def test_an_answer_without_matches_is_drawn(self, answer: LocalizationResult | Rejected) -> None:
+        (found,) = read_answers(written(answer), "f")
+        html = answer_page("", found.answer, PHOTO, CAMERA, BOTH)
+        assert "0 matches" in html
 
     @pytest.mark.parametrize(
         ("content", "message"),
@@ -237,7 +256,29 @@ class TestAnswers:
             ('{"photo": "a"}', "f: the answer has no camera and no matches"),
             ('{"photo": "a", "camera": {}}', "f: no answer as"),
             ('{"photo": "a", "camera": 3}', "f: no answer as"),
-            (written(localized(debug=replace(debug(), error_px=np.zeros(3)))), "columns of different lengths"),
+            (
+                written(localized(debug=replace(debug(), error_px=np.zeros(3)))),
+                "debug.error_px has the shape (3,), not (200,)",
+            ),
+            (
+                written(localized(debug=replace(debug(), query_px=np.zeros(200)))),
+                "query_px has the shape (200,), not (200, 2)",
+            ),
+            (written(localized(debug=replace(debug(), x_in_world=np.zeros((200, 2))))), "not (200, 3)"),
+            (written(localized(debug=replace(NO_MATCHES, query_px=np.zeros((1, 2))))), "not (0, 2)"),
+            (
+                written(localized(debug=replace(debug(), reference=np.full(200, 2)))),
+                "has 2, but the answer has 2 references",
+            ),
+            (written(localized(debug=replace(debug(), reference=np.full(200, -1)))), "debug.reference has -1"),
+            (written(localized(debug=replace(debug(), is_inlier=np.full(200, 0.5)))), "elements of the type bool"),
+            (written(localized(covariance=np.eye(3))), "covariance has the shape (3, 3), not (6, 6)"),
+            (written(localized(inlier_count="many")), "'many' is not of the type int"),
+            (
+                written(rejected(hint=replace(HINT, best_reference="../a"))),
+                "must be scenes/{scene}/references/{reference}",
+            ),
+            *((written(localized(), name), "photo must name a file in the folder") for name in OUTSIDE),
         ],
     )
     def test_what_is_no_answer_is_named_with_its_line(self, content: str, message: str) -> None:
@@ -263,3 +304,46 @@ class TestAnswers:
         assert done.exit_code in (1, 2)
         assert message in done.stderr
         assert "Traceback" not in done.output
+
+
+def drawn(tmp_path: Path, answers: str, *flags: str) -> Result:
+    """The result of `draw` for the photographs of a folder, which writes to "pages"; no store is there."""
+    (tmp_path / "answers.jsonl").write_text(answers)
+    for name in ("a.jpg", "a_b.jpg", "a/b.jpg"):
+        (tmp_path / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "photos" / name).write_bytes(PHOTO)
+    answers_file, photos, pages = (str(tmp_path / it) for it in ("answers.jsonl", "photos", "pages"))
+    store = {"MAPLESS_DATA_DIR": str(tmp_path / "store")}
+    return CliRunner().invoke(app, ["draw", answers_file, photos, "--output", pages, *flags], env=store)
+
+
+class TestPages:
+    def test_each_answer_has_a_page_of_its_own(self, tmp_path: Path) -> None:
+        names = ("a.jpg", "a/b.jpg", "a_b.jpg", "a.jpg", "a.jpg", "./a.jpg")
+        done = drawn(tmp_path, "\n".join(written(UNKNOWN, name) for name in names))
+        assert done.exit_code == 0, done.output
+        pages = {str(it.relative_to(tmp_path / "pages")) for it in (tmp_path / "pages").rglob("*.html")}
+        assert pages == {f"{it}.html" for it in ("a.jpg", "a/b.jpg", "a_b.jpg", "a.jpg-2", "a.jpg-3", "a.jpg-4")}
+        assert done.stdout == f"6 pages are in {tmp_path / 'pages'}\n"
+
+    def test_answers_without_references_need_no_server(self, tmp_path: Path) -> None:
+        done = drawn(tmp_path, written(UNKNOWN))
+        assert (done.exit_code, done.stderr) == (0, "")
+        assert done.stdout == f"1 page is in {tmp_path / 'pages'}\n"
+        assert not (tmp_path / "store").exists()
+        assert "left out" not in (tmp_path / "pages/a.jpg.html").read_text()
+
+    def test_without_a_server_pages_say_what_is_missing(self, tmp_path: Path) -> None:
+        with socket.socket() as unused:
+            unused.bind(("127.0.0.1", 0))  # and does not listen
+            address = f"127.0.0.1:{unused.getsockname()[1]}"
+            done = drawn(tmp_path, f"{written(localized())}\n{written(rejected(), 'a_b.jpg')}", "--address", address)
+        assert done.exit_code == 0, done.output
+        assert done.stderr.count("references are left out, because the server did not give them: UNAVAILABLE") == 1
+        for name in ("a.jpg", "a_b.jpg"):
+            assert "references are left out, because" in (tmp_path / f"pages/{name}.html").read_text()
+
+    def test_wrong_options_of_the_connection_are_wrong_usage(self, tmp_path: Path) -> None:
+        done = drawn(tmp_path, written(localized()), "--address", "127.0.0.1:1", "--ca", str(tmp_path / "none.pem"))
+        assert done.exit_code == 2
+        assert "none.pem cannot be read" in done.stderr

@@ -1,9 +1,10 @@
 """Answers as `mapless localize --debug` writes them, read again."""
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
 from datetime import datetime
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -11,14 +12,18 @@ import numpy as np
 from google.protobuf import json_format
 
 from mapless import Camera, LocalizationResult, Rejected, RigidTransform, wire
+from mapless.diagnostics import Debug
+from mapless.names import parse_reference_name
 from mapless.v1 import geometry_pb2
 
 _COMMAND = "`mapless localize --debug --output FILE`"
+_ROWS = {"query_px": (2,), "x_in_world": (3,), "reference_px": (2,)}
+"""Shapes of a match's values in the columns of `Debug` that have several."""
 
 
 @dataclass(frozen=True, eq=False)
 class Written:
-    """An answer with the photograph's name and camera."""
+    """An answer with the photograph's name, which is a path in the folder that was localized, and its camera."""
 
     photo: str
     camera: Camera
@@ -46,11 +51,9 @@ def read_answers(text: str, name: str) -> Iterator[Written]:
             raise ValueError(f"{where}: the answer has no camera and no matches; {_COMMAND} writes them")
         kind = Rejected if "reason" in entry else LocalizationResult
         try:
-            answer = _value(kind, entry)
-            _check_lengths(answer)
-            yield Written(str(entry["photo"]), _value(Camera, entry["camera"]), answer)
-        except (KeyError, TypeError, ValueError, AttributeError, json_format.ParseError) as error:
-            raise ValueError(f"{where}: no answer as {_COMMAND} writes it: {error!r}") from error
+            yield Written(_photo(entry["photo"]), _value(Camera, entry["camera"]), _checked(_value(kind, entry)))
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, json_format.ParseError) as error:
+            raise ValueError(f"{where}: no answer as {_COMMAND} writes it: {error}") from error
 
 
 def _parsed(where: str, line: str) -> Any:
@@ -58,6 +61,14 @@ def _parsed(where: str, line: str) -> Any:
         return json.loads(line)
     except ValueError as error:
         raise ValueError(f"{where} is not JSON: {error}") from None
+
+
+def _photo(name: Any) -> str:
+    """The name, with / between its parts; ValueError if it is none in a folder: the file may be another machine's."""
+    path = Path(_value(str, name))
+    if path.anchor or ".." in path.parts or not path.name:
+        raise ValueError(f"photo must name a file in the folder of photographs, without '..', is {name!r}")
+    return path.as_posix()
 
 
 def _value(kind: Any, value: Any) -> Any:
@@ -72,7 +83,12 @@ def _value(kind: Any, value: Any) -> Any:
         return wire.camera_from_message(json_format.ParseDict(value, geometry_pb2.CameraIntrinsics()), "")
     if get_origin(kind) is np.ndarray:
         (element,) = get_args(get_args(kind)[1])
-        return np.array(value, element)  # None, for a number that is not finite, becomes NaN
+        array = np.array(value, element)  # None, for a number that is not finite, becomes NaN
+        if array.size and array.dtype.kind != "f" and np.array(value).dtype.kind != array.dtype.kind:
+            raise ValueError(f"an array must have elements of the type {array.dtype}")
+        return array
+    if get_origin(kind) is Mapping:
+        return {name: _value(get_args(kind)[1], it) for name, it in value.items()}
     if get_origin(kind) is tuple:
         return tuple(_value(get_args(kind)[0], it) for it in value)
     if kind is datetime:
@@ -83,12 +99,35 @@ def _value(kind: Any, value: Any) -> Any:
         types = get_type_hints(kind)
         given = {it.name: value[it.name] for it in fields(kind) if it.init and it.name in value}
         return kind(**{name: _value(types[name], it) for name, it in given.items()})
+    if kind in (bool, int, float, str) and not isinstance(value, (int, float) if kind is float else kind):
+        raise TypeError(f"{value!r} is not of the type {kind.__name__}")
     return value
 
 
-def _check_lengths(answer: LocalizationResult | Rejected) -> None:
-    if answer.debug is None:
-        return
-    counts = {name: len(column) for name, column in vars(answer.debug).items()}
-    if len(set(counts.values())) > 1:
-        raise ValueError(f"the matches have columns of different lengths: {counts}")
+def _checked(answer: LocalizationResult | Rejected) -> LocalizationResult | Rejected:
+    """The answer with the shapes of its arrays; ValueError if one has another, or a reference's name is none."""
+    uses = answer.diagnostics.references
+    hint = answer.hint if isinstance(answer, Rejected) else None
+    for name in [*(it.name for it in uses), *([hint.best_reference] if hint is not None else [])]:
+        if name:
+            parse_reference_name(name)
+    covariance = answer.covariance if isinstance(answer, LocalizationResult) else None
+    if covariance is not None and covariance.shape != (6, 6):
+        raise ValueError(f"covariance has the shape {covariance.shape}, not (6, 6)")
+    return answer if answer.debug is None else replace(answer, debug=_shaped(answer.debug, len(uses)))
+
+
+def _shaped(debug: Debug, reference_count: int) -> Debug:
+    """The matches, also where there are none: JSON keeps no shape (0, 2)."""
+    (count,) = debug.is_inlier.shape[:1] or (0,)
+    columns: dict[str, Any] = {}
+    for name, column in vars(debug).items():
+        shape = (count, *_ROWS.get(name, ()))
+        columns[name] = column.reshape(shape) if count == 0 and column.shape == (0,) else column
+        if columns[name].shape != shape:
+            raise ValueError(f"debug.{name} has the shape {column.shape}, not {shape}")
+    outside = (debug.reference < 0) | (debug.reference >= reference_count)
+    if outside.any():
+        first = debug.reference[outside][0]
+        raise ValueError(f"debug.reference has {first}, but the answer has {reference_count} references, from 0")
+    return Debug(**columns)

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
-from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from mapless_tools.connection import Connection, with_flags
-
-if TYPE_CHECKING:
-    from mapless import Client, LocalizationResult, Reference, Rejected
-
-MAX_REFERENCES = 16
-"""References of an answer on its plan."""
 
 
 @with_flags
@@ -25,52 +19,60 @@ def draw_command(
         Path, typer.Argument(help="File that `mapless localize --debug --output FILE` wrote; - for standard input.")
     ],
     photo: Annotated[Path, typer.Argument(help="The photograph, or the folder of photographs, that was localized.")],
-    output: Annotated[Path, typer.Option(help="Folder for the pages, one for each photograph.")] = Path("pages"),
+    output: Annotated[
+        Path, typer.Option(help="Folder for the pages, one for each answer, in the sub-folders of the photographs.")
+    ] = Path("pages"),
     *,
     connection: Connection,
 ) -> None:
     """Draw answers as HTML pages: the photograph with its matches, the best references, the plan, and the figures.
 
-    A page has less than 5 MB, loads nothing and runs no scripts. The references come from the server.
+    A page has less than 5 MB, loads nothing and runs no scripts. The references come from the server, which is asked
+    only for answers that name some; without it the pages have no references, and say so.
     """
     from mapless_server.serve.signals import terminable
-    from mapless_server.settings import load_settings
-    from mapless_tools.connection import connected
-    from mapless_tools.plan import down_of
     from mapless_tools.usage import failures_end_command
 
     from .answers import read_answers
     from .page import answer_page
+    from .references import ReferenceSource
 
     with failures_end_command(ValueError):
         text = sys.stdin.read() if str(answers) == "-" else answers.read_text(encoding="utf-8")
         written = [(it, _photo_of(photo, it.photo)) for it in read_answers(text, str(answers))]
-        output.mkdir(parents=True, exist_ok=True)
-        settings = load_settings({}).settings
-        with terminable(), connected(connection, settings) as client:
+        missing: set[str] = set()
+        taken: set[str] = set()
+        with terminable(), ExitStack() as stack:
+            source = ReferenceSource(connection, stack)
             for it, file in written:
-                references = list(references_of(client, it.answer))
-                scene = client.get_scene(references[0].scene_id) if references else None
-                poses = [reference.world_from_camera for reference in references]
-                down = down_of(scene, poses) if references else None
-                page = answer_page(it.photo, it.answer, file.read_bytes(), it.camera, references, down)
-                (output / f"{it.photo.replace('/', '_')}.html").write_text(page, encoding="utf-8")
-    print(f"{len({it.photo for it, _ in written})} pages are in {output}")
+                found = source.find(it.answer)
+                if found.missing and found.missing not in missing:
+                    print(f"mapless-server: {found.missing}", file=sys.stderr)
+                    missing.add(found.missing)
+                page = output / f"{_free_name(it.photo, taken)}.html"
+                page.parent.mkdir(parents=True, exist_ok=True)
+                html = answer_page(
+                    it.photo,
+                    it.answer,
+                    file.read_bytes(),
+                    it.camera,
+                    found.references,
+                    found.down_in_world,
+                    missing=found.missing,
+                )
+                page.write_text(html, encoding="utf-8")
+    print(f"1 page is in {output}" if len(written) == 1 else f"{len(written)} pages are in {output}")
 
 
-def references_of(client: Client, answer: LocalizationResult | Rejected) -> Iterator[Reference]:
-    """Fetches the references of an answer, the best with their photographs; passes over those that are deleted."""
-    from mapless import NotFound
-    from mapless.names import parse_reference_name
+def _free_name(photo: str, taken: set[str]) -> str:
+    """A photograph's name, -2 and so on behind it where another answer has it; adds it to those that are taken.
 
-    from .page import best_references
-
-    best = best_references(answer)
-    uses = sorted(answer.diagnostics.references, key=lambda use: (-use.inlier_count, -use.match_count))
-    names = dict.fromkeys([*best, *(use.name for use in uses if use.match_count)])
-    for name in list(names)[:MAX_REFERENCES]:
-        with suppress(NotFound):
-            yield client.get_reference(*parse_reference_name(name), include_image=name in best)
+    Names that differ in case alone are one on some disks.
+    """
+    names = itertools.chain([photo], (f"{photo}-{number}" for number in itertools.count(2)))
+    name = next(it for it in names if it.casefold() not in taken)
+    taken.add(name.casefold())
+    return name
 
 
 def _photo_of(given: Path, name: str) -> Path:

@@ -65,6 +65,7 @@ def answer_page(
     camera: Camera,
     references: Sequence[Reference] = (),
     down_in_world: ArrayLike | None = None,
+    missing: str = "",
 ) -> str:
     """The page of an answer, less than 5 MB of HTML.
 
@@ -75,6 +76,7 @@ def answer_page(
         camera: as it was sent.
         references: references of the scene, for the plan; the `best_references` with images are shown.
         down_in_world: direction of gravity in the scene; None to estimate it from the cameras.
+        missing: a sentence on references that are left out.
     """
     known = {_name(it): it for it in references}
     text = str(answer)
@@ -84,6 +86,7 @@ def answer_page(
         text=text,
         photograph=_photograph(answer, image, camera),
         hinted=_hinted(answer, known),
+        missing=missing,
         pairs=_pairs(answer, image, camera, known),
         svgs=_charts(answer, camera, known, down_in_world),
         tables=[it for it in _tables(answer) if it.rows],
@@ -207,7 +210,9 @@ def _charts(
 
 
 def _inlier_points(debug: Debug | None) -> NDArray[np.float64]:
-    return np.empty((0, 3)) if debug is None else debug.x_in_world[debug.is_inlier]
+    if debug is None:
+        return np.empty((0, 3))
+    return debug.x_in_world[debug.is_inlier & np.isfinite(debug.x_in_world).all(axis=1)]
 
 
 def _tables(answer: Answer) -> list[Table]:
