@@ -234,7 +234,7 @@ def _files_of(folder: Path) -> Iterator[Path]:
 
 
 def _folders_in(place: Path) -> Iterator[Path]:
-    return (Path(it) for it in _entries(place) if it.is_symlink() or it.is_dir())
+    return (Path(it) for it in _entries(place) if it.is_dir())
 
 
 def _files_in(place: Path, name: re.Pattern[str]) -> Iterator[Path]:
