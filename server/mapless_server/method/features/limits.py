@@ -15,5 +15,5 @@ EPIPOLAR_PX = 2.0
 INLIER_PX = 4.0
 """Largest reprojection error of a right match."""
 
-LOOSE_PX = 12.0
-"""The same at a pose or of a point that is not exact yet."""
+INEXACT_INLIER_PX = 12.0
+"""Largest reprojection error of a right match at a pose, or of a point, that is not exact yet."""

@@ -17,7 +17,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import PriorCheck, Priors
-from ..features.limits import LOOSE_PX
+from ..features.limits import INEXACT_INLIER_PX
 from ..optim.optimize import covariance_in_world
 from ..options import LocalizeOptions
 from ..pose.with_priors import MIN_INLIERS
@@ -40,8 +40,8 @@ from .trust import trust_of_group
 
 SHOULD_SHOW, LEAST_NEAR = 15, 3
 """The last photograph, not localized alone, contradicts the pose that it is tracked to if so many points should be
-visible, or are matched, and fewer of its matches are near them, within `LOOSE_PX` and three standard deviations of the
-pose. Evidence: group-sequences."""
+visible, or are matched, and fewer of its matches are near them, within `INEXACT_INLIER_PX` and three standard
+deviations of the pose. Evidence: group-sequences."""
 
 INDEPENDENT = 2.0
 """Photographs of a sequence count as at most so many independent ones in the covariance of a pose: they share
@@ -159,7 +159,7 @@ def _last_contradicted(estimate: JointEstimate[SequenceState], frame_count: int)
     # Not the depth: after a jump by a rotation, the points are behind the camera.
     rays_m = source.structure.x_in_world[last.matches.point] - last.world_from_camera.translation
     distance_m = np.median(np.linalg.norm(rays_m, axis=1))
-    bound_px = LOOSE_PX + 3 * focal_px * (max(sigma[:3]) / max(distance_m, 1e-9) + max(sigma[3:]))
+    bound_px = INEXACT_INLIER_PX + 3 * focal_px * (max(sigma[:3]) / max(distance_m, 1e-9) + max(sigma[3:]))
     near = int((last.errors_px[~last.matches.guided] < bound_px).sum())
     return last if near < LEAST_NEAR else None
 

@@ -13,7 +13,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import Priors
-from ..features.limits import LOOSE_PX
+from ..features.limits import INEXACT_INLIER_PX
 from ..judge.evidence import PNP as QUICK_PNP
 from ..pose.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from ..pose.pnp import PnpOptions
@@ -123,7 +123,7 @@ class Session:
 
     def _inliers(self, matched: MatchedImage, pose: RigidTransform) -> int:
         camera = matched.camera_matches(RigidTransform.identity())
-        return int(camera.inliers(pose, LOOSE_PX).sum())
+        return int(camera.inliers(pose, INEXACT_INLIER_PX).sum())
 
     def _of_all_matches(self, cameras: Sequence[CameraMatches]) -> Similarity | None:
         """Estimates `world_from_session` of the whole sequence as one camera; None if no pose explains four matches."""
@@ -132,7 +132,7 @@ class Session:
         else:
             rigid = rig_ransac(cameras, PNP)
             guess = None if rigid is None else Similarity(1.0, rigid.rotation, rigid.translation)
-        if guess is None or inlier_count(cameras, guess, LOOSE_PX) < MIN_INLIERS:
+        if guess is None or inlier_count(cameras, guess, INEXACT_INLIER_PX) < MIN_INLIERS:
             return None
         return guess
 

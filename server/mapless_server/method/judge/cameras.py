@@ -119,7 +119,7 @@ def advice_for(lens: Distortion | None, wrong: Sequence[IntrinsicsCheck]) -> str
 
 
 MANY_MATCHES = 100
-"""So many, with points or with one reference, are not chance."""
+"""Matches with points from which another camera needs to score less, see `MIN_GAIN`; chance gives fewer."""
 
 MIN_GAIN, LARGE_SHARE, MIN_GAIN_ELSE = 1.1, 0.45, 1.2
 """A pose is rejected if one of another camera scores this many times as high, where there are many matches with points

@@ -36,7 +36,8 @@ LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 
 """Below these evidence is not better or worse."""
 
 MAJORITY = 0.5
-"""Share of a whole from which it counts as the whole."""
+"""A majority: of a half's matches, which then lead to the pose that they agree with; of a pose's keypoints, of
+which another pose must explain as many to rival it; and of a rival's, those of references that agree with it more."""
 
 LEAST_AGREEING = 8
 """Where the majority of a half's matches agree with the pose, and so many, the half's own pose is near it."""

@@ -13,8 +13,7 @@ from ..bundle.estimate import PosedSupport
 from ..features.views import PosedView, View
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .answer import Answer
-from .cameras import MANY_MATCHES, compare_cameras
-from .evidence import MAJORITY
+from .cameras import compare_cameras
 
 _STAGES = {
     RejectionReason.NO_USABLE_REFERENCES: "coarse",
@@ -41,8 +40,11 @@ FEW_FEATURES = 200
 FEW_MATCHES = 30
 """References of another place have fewer matches with a photograph by chance."""
 
-LITTLE = 0.25
-"""Share of what is expected below which something is wrong."""
+MANY_MATCHES = 100
+"""A reference with so many matches shows what the photograph shows."""
+
+LEAST_USUAL_SHARE = 0.25
+"""Share of a reference's matches that at least have points, and agree on a pose, unless something is wrong."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ def hinted(
     advice, message = _advice(case)
     share = query.photograph.ignored_share if query.photograph else 0.0
     # Vehicles, grippers and people take less, inverted masks ignore more.
-    if share >= MAJORITY or (share > 0 and case.features < FEW_FEATURES):
+    if share >= 0.5 or (share > 0 and case.features < FEW_FEATURES):
         percent = f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
         message += f" The mask ignores {percent} of the image: 0 means ignore, every other value use."
     hint = Hint(_STAGES.get(rejection.reason, "judge") if references else "", advice, message, case.best)
@@ -154,9 +156,9 @@ def _of_overlap(case: _Case) -> tuple[Advice, str]:
             Advice.CHOOSE_OTHER_REFERENCES,
             f"Use references that show what the photograph shows: {shared}, no more than chance gives.",
         )
-    if case.matches >= MANY_MATCHES and case.tried is not None and case.tried < LITTLE * case.matches:
+    if case.matches >= MANY_MATCHES and case.tried is not None and case.tried < LEAST_USUAL_SHARE * case.matches:
         # Even if what two references show were independent, they would have so many of the features in common.
-        if case.tried < LITTLE * case.matches * case.second / case.features and case.second >= MANY_MATCHES:
+        if case.tried < LEAST_USUAL_SHARE * case.matches * case.second / case.features and case.second >= MANY_MATCHES:
             return (
                 Advice.CHECK_CALIBRATION,
                 f"Check the references' poses, for which `mapless-server audit` helps: world_from_camera (not its "
@@ -185,7 +187,7 @@ def _of_overlap(case: _Case) -> tuple[Advice, str]:
 
 def _agrees_little(case: _Case) -> bool:
     """Whether one reference shares more with the photograph than chance could, and little of it agrees on a pose."""
-    return case.matches >= MANY_MATCHES and case.inliers < LITTLE * case.matches
+    return case.matches >= MANY_MATCHES and case.inliers < LEAST_USUAL_SHARE * case.matches
 
 
 def _retake(case: _Case) -> str:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 
 from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance, with_halves
-from ..features.limits import LOOSE_PX
+from ..features.limits import INEXACT_INLIER_PX
 from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.one_reference import Found
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
@@ -247,7 +247,7 @@ def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, Pos
     errors_px = votes.seen.errors_px(estimate.world_from_camera)
     own = errors_px < RIVAL_PNP.inlier_px
     wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(MAJORITY * votes.keypoint_count(own))))
-    candidates = _outliers(votes, own, ~(errors_px < LOOSE_PX), len(support.references))
+    candidates = _outliers(votes, own, ~(errors_px < INEXACT_INLIER_PX), len(support.references))
     if votes.keypoint_count(candidates) < wanted:
         return None
     rival = _second_pose(camera, votes[candidates], wanted)
