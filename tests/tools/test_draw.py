@@ -4,8 +4,10 @@ import base64
 import json
 import re
 import socket
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import cv2
 import numpy as np
@@ -16,6 +18,7 @@ from support.images import encode, textured, with_exif_orientation
 from support.planted_answers import CAMERA, NOW, debug, diagnostics, localized, rejected, truth
 from typer.testing import CliRunner, Result
 
+from mapless import Client, MaplessError, NotFound, PermissionDenied
 from mapless.answers import Hint, Hypothesis, LocalizationResult, Rejected
 from mapless.cli.output import plain
 from mapless.diagnostics import Debug
@@ -347,3 +350,27 @@ class TestPages:
         done = drawn(tmp_path, written(localized()), "--address", "127.0.0.1:1", "--ca", str(tmp_path / "none.pem"))
         assert done.exit_code == 2
         assert "none.pem cannot be read" in done.stderr
+
+    @pytest.mark.parametrize(
+        ("error", "sentence", "calls"),
+        [
+            (NotFound("NOT_FOUND", "gone"), "1 of 2 references are left out", 4),
+            (PermissionDenied("PERMISSION_DENIED", "no"), "did not give them: PERMISSION_DENIED: no", 2),
+        ],
+        ids=["deleted", "refused"],
+    )
+    def test_deleted_references_are_counted_refusals_end_asking(
+        self, error: MaplessError, sentence: str, calls: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        client = create_autospec(Client, instance=True)
+        client.get_reference.side_effect = [BOTH[0], error] * 2
+        client.get_scene.side_effect = NotFound("NOT_FOUND", "gone")
+        monkeypatch.setattr("mapless_tools.draw.references.connected", lambda *_: nullcontext(client))
+        done = drawn(tmp_path, f"{written(localized())}\n{written(localized(), 'a_b.jpg')}")
+        assert done.exit_code == 0, done.output
+        assert done.stderr.count(sentence) == 1
+        assert client.get_reference.call_count == calls
+        for name in ("a.jpg", "a_b.jpg"):
+            html = (tmp_path / f"pages/{name}.html").read_text()
+            assert sentence in html
+            assert ("inliers on points that it shows, 90" in html) == (calls == 4)
