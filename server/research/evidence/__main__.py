@@ -24,6 +24,7 @@ MODULES = {
     "mask_margin": ("mask-margin",),
     "scene_agreement": ("scene-agreement",),
     "rungs": ("rungs",),
+    "readings": ("readings",),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }
 """The keys of each module, by its MEASUREMENTS; a module is imported when one of them is measured."""

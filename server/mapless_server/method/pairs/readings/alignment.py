@@ -31,10 +31,13 @@ AGREEING_DEG = 5.0
 """Between the rotations of two pairs. Relative poses of few matches are off by a degree or two."""
 LEAST_PAIRS = 3
 """Fewer pairs do not show that a similarity is right: two may agree by chance."""
+MIN_PHOTOGRAPHS = 2
+"""Photographs of either world that take part: at one alone no distance of its world is seen."""
 MAX_SIGMA = 0.03
-"""Largest standard deviations of a unique similarity: of the scale, relative; of the rotation, radians; and of the
-position of the other session's middle, as a share of its extent or, if that is more, of the distance between paired
-cameras."""
+"""Largest standard deviation of the scale of a unique similarity, relative, and of the position of the other session's
+middle, as a share of its extent or, if that is more, of the distance between paired cameras."""
+MAX_ROTATION_SIGMA = math.radians(1.0)
+"""The same of its rotation, radians."""
 STEPS = MinimizeOptions(30, 1e-6)
 _DIFFERENCE = 1e-6
 _INFLATION = 3.0  # errors of matches of a pair, and of poses of a session, are not independent
@@ -65,8 +68,8 @@ class Alignment:
     @property
     def is_unique(self) -> bool:
         """Whether the pairs determine all of it, and fit."""
-        largest = max(self.scale_sigma, self.rotation_sigma, self.position_sigma)
-        return self.bad_share <= FEW_SHARE and largest <= MAX_SIGMA
+        is_known = max(self.scale_sigma, self.position_sigma) <= MAX_SIGMA and self.rotation_sigma <= MAX_ROTATION_SIGMA
+        return self.bad_share <= FEW_SHARE and is_known
 
     @property
     def text(self) -> str:
@@ -85,7 +88,8 @@ def align(views: Views, matched: Sequence[MatchedPair]) -> Alignment | None:
     None if the pairs are too few, or no similarity fits any of them.
     """
     matched = sorted(matched, key=lambda it: -len(it.matches))[:MOST_PAIRS]
-    if len(matched) < LEAST_PAIRS:
+    fewest = min(len({it.pair[side] for it in matched}) for side in (0, 1)) if matched else 0
+    if len(matched) < LEAST_PAIRS or fewest < MIN_PHOTOGRAPHS:
         return None
     sample = PairSample(views, matched, SAMPLED_MATCHES)
     worlds = _Worlds.of(sample, [it.pair for it in matched])

@@ -16,8 +16,12 @@ from ...features.views import PosedView
 from .errors import FEW_SHARE, PairSample, summary
 from .repeats import EXACT_DIGITS
 
+MIN_POSES = 4
+"""Fewer poses may have round numbers by chance."""
 DIGITS = range(-4, 7)
-"""Digits after the point that are tried, negative before it; of rotations those after it."""
+"""Digits after the point that are tried for positions; negative before it."""
+MOST_ROTATION_DIGITS = 4
+"""The same for rotations, from one on: more digits than these are enough."""
 EXPLAINED_FACTOR = 3.0
 """Rounding explains errors that are at most so many times those that it makes."""
 
@@ -28,6 +32,8 @@ def steps_of(poses: Sequence[RigidTransform]) -> tuple[Array, float]:
     A pose that is given several times counts once.
     """
     poses = list({pose.matrix().round(EXACT_DIGITS).tobytes(): pose for pose in poses}.values())
+    if len(poses) < MIN_POSES:
+        return np.zeros(3), 0.0
     positions = np.array([pose.translation for pose in poses])
     return np.array([_step(positions[:, axis]) for axis in range(3)]), _rotation_step(poses)
 
@@ -47,7 +53,7 @@ def _step(values: Array) -> float:
 
 
 def _rotation_step(poses: Sequence[RigidTransform]) -> float:
-    for digits in range(1, DIGITS.stop):
+    for digits in range(1, MOST_ROTATION_DIGITS + 1):
         rounded = [_is_of_rounded_matrix(pose, digits) or _is_of_rounded_quaternion(pose, digits) for pose in poses]
         if np.mean(rounded) >= FEW_SHARE:  # a rounded matrix is not always nearest to the rotation made of it
             return 10.0**-digits

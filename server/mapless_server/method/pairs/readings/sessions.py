@@ -19,6 +19,9 @@ MIN_GROUP, MIN_BETWEEN = 3, 6
 MIN_INSIDE_SHARE = 0.8
 """Least share of the pairs inside a session that agree. Evidence: scene-agreement."""
 
+ROUNDS = 3
+"""Most rounds in which photographs change their group; they may alternate between two that agree as much."""
+
 
 def sessions_of(agrees: Mapping[tuple[K, K], bool]) -> tuple[tuple[K, ...], tuple[K, ...]] | None:
     """The photographs of the two largest sessions, the larger first; None if there are not two.
@@ -52,8 +55,7 @@ def _grouped(links: Mapping[K, Mapping[K, int]]) -> dict[K, int]:
     """Groups of photographs: each is in the group with which most of its pairs agree, by the number of votes."""
     group: dict[K, int] = {}
     order = _along_agreeing(links)
-    before: dict[K, int] | None = None
-    while group != before:  # each change makes more pairs agree
+    for _ in range(ROUNDS):
         before = dict(group)
         for number, key in enumerate(order):
             votes: Counter[int] = Counter()
@@ -65,6 +67,8 @@ def _grouped(links: Mapping[K, Mapping[K, int]]) -> dict[K, int]:
                 group[key] = best
             elif key not in group:
                 group[key] = len(order) + number
+        if group == before:
+            break
     return group
 
 
