@@ -137,7 +137,8 @@ PNP = PnpOptions(min_iterations=30, max_iterations=300, max_matches=300)
 """RANSAC of the poses by points. Few matches suffice to compare cameras."""
 
 LINES = RelativePoseOptions(min_iterations=50, max_iterations=150, pair_iterations=200, strongest=1)
-"""The search where the given pose rests on matches without points; brief, 20 to 40 ms a camera."""
+"""The search by all matches: of each camera where the pose rests on matches without points, 20 to 40 ms; of two cameras
+before one is accused by points, whose own search takes longer."""
 
 
 @dataclass(frozen=True)
