@@ -65,7 +65,9 @@ def read_place(folder: Path, step: int) -> Place:
         view = extractor.extract(decode_image(frame.image_path.read_bytes(), ImageLimits()), frame.camera)
         views[i] = PosedView(frame.name, frame.name, view, frame.world_from_camera)
     found = [((i, j), distinct_matches(views[i].view, views[j].view)) for i, j in combinations(views, 2)]
-    pairs = [MatchedPair(ends, consistent(*(views[i].view for i in ends), matches)) for ends, matches in found]
+    pairs = [
+        MatchedPair(ends, consistent(views[ends[0]].view, views[ends[1]].view, matches)) for ends, matches in found
+    ]
     return Place(folder.name, views, [it for it in pairs if len(it.matches)])
 
 
