@@ -25,6 +25,7 @@ from research.places import Scenes
 from .page import Measurement, Row
 
 PHOTOGRAPHS = 8
+SUFFIXES = (".jpg", ".jpeg", ".png")
 MODULES = (alignment, explanation, repeats, rounding, sessions, verdict)
 """The modules that use the share."""
 SHARES = (0.15, 0.2, 0.25, 0.3, 0.4)
@@ -121,7 +122,8 @@ def _focal(camera: Camera, focal_px: float) -> Camera:
 def _places(scenes: Scenes) -> Iterator[Place]:
     """Eight photographs of each scene, in two spacings."""
     for name in scenes.names:
-        count = len(scenes.dataset(name).frames)
+        frames = scenes.dataset(name).frames
+        count = len(frames) if all(it.image_path.suffix.lower() in SUFFIXES for it in frames) else 0
         steps = dict.fromkeys((1, min(20, count // PHOTOGRAPHS)))
         for step in steps if count >= PHOTOGRAPHS else ():
             yield read_place(scenes.folder / name, step)
