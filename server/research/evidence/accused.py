@@ -141,11 +141,11 @@ class Scenes:
         view, references = self.view_of(asked.scene, asked.frame, asked.planted), self.references(asked)
         found = list[float]()
 
-        def recorded(sigmas: float, tested: int) -> bool:
-            found.append(significance.log10_chance(sigmas, tested))
-            return significance.is_significant(sigmas, tested)
+        def recorded(compared: cameras.Comparison) -> bool:
+            found.append(significance.log10_chance(compared.sigmas, compared.tested))
+            return significance.is_significant(compared.sigmas, compared.tested)
 
-        with patch.object(cameras, "is_significant", recorded):
+        with patch.object(cameras.Comparison, "is_significant", property(recorded)):
             answer = hinted(localize(view, references, self.pipeline, LocalizeOptions()), view, references)
         checks = answer.outcome.intrinsics_checks
         if len(checks) == len(IntrinsicsParameter):  # of another camera only those that differ are named

@@ -306,7 +306,8 @@ def test_a_camera_that_a_search_by_points_missed_is_not_accused(fitting: int) ->
     support = replace(solved, structure=structure, matches=matches, estimate=missed, two_view=None)
     compared = compare_cameras(support)
     assert compared is not None
-    assert (compared.gain > 1.1 and compared.is_significant) == (fitting == 120)
+    assert compared.gain > 1.1
+    assert compared.is_significant == (fitting == 120)
 
 
 def without_evidence(support: PosedSupport) -> PosedSupport:

@@ -12,10 +12,10 @@ agree with one pose of a camera that is nearer to the true one. So poses are com
 values of k1, without the lens, and, where these are unusual, with the principal point in the centre and with square
 pixels; the score of `pose.relative` compares them, by points and by matches without points together.
 
-A camera is accused only if its best pose, found from all matches as that of the other camera is, scores lower, and if
-that is significant (`bundle.significance`): if the keypoints that score higher with another camera outweigh those that
-score lower by more than chance. A pose that other cameras explain better is rejected also where it is not significant,
-for lack of evidence.
+A camera is accused only if that is significant (`bundle.significance`): if the keypoints that score higher with another
+camera outweigh those that score lower by more than chance, with the best poses of both cameras that are found from all
+matches. A pose that is explained clearly worse than one of another camera is rejected also where that is not
+significant, for lack of evidence.
 """
 
 from collections.abc import Iterator, Sequence
@@ -217,7 +217,7 @@ class _Compared:
 
         The search by points alone fails where few of them are right. Two cameras then differ by whether it failed.
         It takes 0.1 to 0.3 s, only where an accusation would follow. A third camera, whose search failed as well, is
-        not found by it: the accusation then is not made.
+        not found by it: no camera is accused then.
         """
         matches = self.matches_of(self.read_as(before.camera))
         poses = (other.pose, find_pose(matches, LINES))
@@ -259,8 +259,9 @@ class Comparison:
     """The given camera and the best of the others.
 
     Attributes:
-        gain: ratio of their scores.
-        sigmas, tested: gain of the other, keypoint by keypoint, in standard deviations; number of cameras compared.
+        gain: ratio of the other's score to that of the photograph's pose.
+        sigmas, tested: gain of the other, keypoint by keypoint, in standard deviations, each with its best pose by all
+            matches where it is significant without; number of cameras compared.
         checks: the parameters in which the two differ, in conflict.
         lens: lens of the given camera.
     """
@@ -304,12 +305,14 @@ def compare_cameras(support: Support) -> Comparison | None:
     if not by_lines:
         between = _between(given, best.camera, steps)
         best, tested = max([best, *map(compared.scored, between)], key=lambda it: it.total), tested + len(between)
-        if is_significant(sigmas_of_gains(best.scores - own.scores), tested):
-            own, best = compared.searched(own, best), compared.searched(best, own)
     sent = query.photograph.camera if query.photograph else given
     checks = _differences(sent, prior_sigma, given, best.camera, steps)
     gain = best.total / own.total if own.total > 0 else np.inf if best.total > 0 else 0.0
-    return Comparison(float(gain), sigmas_of_gains(best.scores - own.scores), tested, checks, sent.distortion)
+    sigmas = sigmas_of_gains(best.scores - own.scores)
+    if not by_lines and is_significant(sigmas, tested):
+        found, searched = compared.searched(best, own), compared.searched(own, best)
+        sigmas = sigmas_of_gains(found.scores - searched.scores)
+    return Comparison(float(gain), sigmas, tested, checks, sent.distortion)
 
 
 def wrong_camera(support: PosedSupport, best_reference: str) -> Rejection | None:
