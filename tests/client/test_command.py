@@ -387,8 +387,8 @@ def test_answers_with_debug_are_drawn_a_page_each(
     draw = ["draw", str(answers), str(folder), "--output", str(pages), "--address", server.address]
     done = CliRunner().invoke(app, draw)
     assert (done.exit_code, done.output) == (0, f"2 pages are in {pages}\n")
-    assert sorted(page.name for page in pages.iterdir()) == ["images_0.png.html", "images_2.png.html"]
-    page = (pages / "images_0.png.html").read_text()
+    assert sorted(page.name for page in (pages / "images").iterdir()) == ["0.png.html", "2.png.html"]
+    page = (pages / "images" / "0.png.html").read_text()
     for shown in ("images/0.png: localized", "90 of 120 matches", "<td>r0</td>", "From above"):  # with references
         assert shown in page
     assert "camera" not in run("localize", scene, folder / "images" / "0.png", "--camera", FOUR_NUMBERS)[1]

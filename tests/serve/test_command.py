@@ -18,6 +18,7 @@ TOOLS = {
     "import": ["folder", "scene"],
     "export": ["scene", "folder"],
     "audit": ["scene"],
+    "draw": ["answers", "photo"],
     "evaluate": ["folder"],
     "replay": ["folder"],
     "replay-bag": ["recording", "scene", "out"],

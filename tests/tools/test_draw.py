@@ -26,8 +26,8 @@ from mapless.geometry import Array
 from mapless.results import Reference
 from mapless_tools.charts import new_axes
 from mapless_tools.cli.app import app
-from mapless_tools.draw import answer_page, best_references
 from mapless_tools.draw.answers import read_answers
+from mapless_tools.draw.page import answer_page, best_references
 from mapless_tools.matches import GOOD, RESIDUAL, WRONG, Shot, axes_on, draw_matches, rendered, side_by_side
 from mapless_tools.plan import basis_from_above, down_of, ellipse_in_plane
 

@@ -19,7 +19,7 @@ from mapless.lenses import LENS_MODELS
 from mapless.v1 import geometry_pb2 as pb
 from mapless_server.method.features.views import undistort_pixels
 from mapless_server.store.codec import decode_geometry, encode_geometry, sha256_for
-from mapless_tools.draw import answer_page
+from mapless_tools.draw.page import answer_page
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.formats.colmap.cameras import from_camera
 from mapless_tools.ingest.formats.writing import PosedImage, cameras_files

@@ -2,7 +2,3 @@
 
 Begin with `page.answer_page`; `mapless-server draw` makes pages of what `mapless localize --debug` has written.
 """
-
-from .page import answer_page, best_references
-
-__all__ = ["answer_page", "best_references"]

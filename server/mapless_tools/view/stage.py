@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapless import Reference
 from mapless.answers import Rejected
 from mapless.geometry import Array
-from mapless_tools.draw import answer_page, best_references
+from mapless_tools.draw.page import answer_page, best_references
 from mapless_tools.matches import Picture, read_picture
 
 from .drawing import DOUBT, OTHER, QUERY, REFERENCE, SELECTED, Drawing
