@@ -30,7 +30,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _unit(item: pytest.Item) -> str:
-    """What a nightly test runs with: those whose marker has one name, which share a costly set-up; else itself.
+    """The tests that a nightly test runs with: those whose marker has one name and one costly set-up; else itself.
 
     Those of `every_tenth` run with each.
     """

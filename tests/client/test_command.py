@@ -79,7 +79,7 @@ def test_from_an_empty_server_to_a_pose(run: Run, tmp_path: Path, camera_json: s
 def test_a_terminal_is_asked_before_deleting(
     run: Run, client: Client, scene: str, answer: str, is_deleted: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is no terminal, as a script's input, is not asked; nor is anybody with --yes."""
+    """Input that is no terminal, as a script's, is not asked; nor is anybody with --yes."""
     typed = io.StringIO(f"{answer}\n" * 2)
     monkeypatch.setattr(typed, "isatty", lambda: True)
     monkeypatch.setattr("sys.stdin", typed)

@@ -15,7 +15,7 @@ MOST, SILENT = 398, 10
 """Numbers, and constants among them without a docstring: what needs one more removes another. The goal is 170 and 0."""
 PLAIN = {0, 1, 2, 0.5}
 COORDINATES = {3, 6}
-"""Of a point, and of a pose."""
+"""Numbers of coordinates of a point, and of a pose."""
 UNITS = {100, 1000, 60, 90, 180, 360, 255, 1024}
 ROUNDING = 1e-6
 SHAPES = {

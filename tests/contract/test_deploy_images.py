@@ -76,7 +76,7 @@ TOGETHER = {"cpu": COMPOSE, "cuda": merged(COMPOSE, CUDA), "shared": SHARED, "bo
 
 
 def all_of(stage: str, word: str) -> list[str]:
-    """What follows an instruction in a stage and in those that it is built on, theirs first."""
+    """The arguments of an instruction in a stage and in those that it is built on, theirs first."""
     base = re.match(r"(\S+) AS", STAGES[stage])[1]  # type: ignore[index]
     return (all_of(base, word) if base in STAGES else []) + re.findall(rf"(?m)^{word} (.*)", STAGES[stage])
 
@@ -86,7 +86,7 @@ def environment_of(stage: str) -> dict[str, str]:
 
 
 def settings_under(given: Json, monkeypatch: pytest.MonkeyPatch) -> Settings:
-    """What the server makes of the image's variables and these; an unknown name or a wrong value raises."""
+    """The server's settings by the image's variables and these; an unknown name or a wrong value raises."""
     for name, value in (environment_of("cpu") | given).items():
         if name.startswith(PREFIX):
             monkeypatch.setenv(name, str(value))

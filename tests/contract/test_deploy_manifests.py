@@ -76,7 +76,7 @@ def values_of(pod: Pod) -> dict[str, str]:
 
 
 def settings_of(pod: Pod, monkeypatch: pytest.MonkeyPatch) -> Settings:
-    """What the server makes of its variables; an unknown name or a wrong value raises."""
+    """The server's settings by its variables; an unknown name or a wrong value raises."""
     for name, value in values_of(pod).items():
         monkeypatch.setenv(name, value)
     return load_settings({}).settings

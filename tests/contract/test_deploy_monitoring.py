@@ -156,7 +156,7 @@ def test_counters_are_not_read_as_they_are() -> None:
 
 
 def promtool(*arguments: str, given: bytes = b"") -> bytes:
-    """What Prometheus's own checks say; an error if they find a fault."""
+    """The output of Prometheus's own checks; an error if they find a fault."""
     program = shutil.which("promtool")
     if program is None:
         assert os.environ.get("TEST_PROMTOOL") != "required"

@@ -1,4 +1,4 @@
-"""What is Ray's in the manifests for KubeRay: Serve takes it, it names what exists, and Ray's ports ask for a token.
+"""Ray in the manifests for KubeRay: Serve takes it, it names what exists, and its ports ask for a token.
 
 As Kubernetes' resources they are checked in test_deploy_manifests.py. KubeRay's own schema is too large.
 """

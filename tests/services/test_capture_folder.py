@@ -273,7 +273,7 @@ def test_a_folder_that_cannot_be_read_is_rejected(tmp_path: Path, monkeypatch: p
 @pytest.mark.parametrize("place", ["tenants", "tenants/acme", "tenants/acme/calls", "tenants/acme/calls/hall"])
 @pytest.mark.parametrize("marked", [True, False])
 def test_a_folder_with_a_link_is_rejected(tmp_path: Path, place: str, marked: bool) -> None:
-    """What is behind the link is neither read nor deleted."""
+    """Files behind the link are neither read nor deleted."""
     path = tmp_path / "c"
     filled(path)
     if not marked:

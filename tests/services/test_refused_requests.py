@@ -75,7 +75,7 @@ GOOD: dict[str, Message] = {
 
 
 def token_of(tenant: str, collection: str) -> str:
-    """Of the page after item r1 of a list."""
+    """Token of the page after item r1 of a list."""
     return base64.urlsafe_b64encode(f"{tenant}\n{collection}\nr1".encode()).decode()
 
 

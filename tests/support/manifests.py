@@ -57,7 +57,7 @@ class Pod:
 
 @cache
 def built(name: str) -> tuple[Json, ...]:
-    """What `kubectl apply -k` of "folder+component+component", below deploy, would send."""
+    """The manifests that `kubectl apply -k` of "folder+component+component", below deploy, would send."""
     folder, *components = name.split("+")
     with TemporaryDirectory() as made:
         up = Path(*[".."] * (len(Path(made).resolve().parts) - 1))

@@ -61,7 +61,7 @@ def has_wal_reset_bug(version: tuple[int, int, int]) -> bool:
 
 
 class Use(Enum):
-    """What a file is opened for; it is created if missing, unless it is only read."""
+    """Purpose for which a file is opened; it is created if missing, unless it is only read."""
 
     WRITE = auto()
     SCRATCH = auto()

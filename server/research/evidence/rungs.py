@@ -1,4 +1,4 @@
-"""What each rung of the ladder earns, where a pose was accepted before it and where none was.
+"""The gain of each rung of the ladder, where a pose was accepted before it and where none was.
 
 Every third case of `research.contradictions` is asked of a server with the settings of the environment.
 """

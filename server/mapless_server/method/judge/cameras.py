@@ -127,7 +127,7 @@ and no large share of them agrees with the pose; else if it scores 1.2 times as 
 with is as right as its radii say, though its camera be a little wrong. Evidence: other-cameras."""
 
 MAX_LINES = 1500
-"""Of more matches with references, every second keypoint, or fewer, is compared."""
+"""Most matches with references that are compared: of more, those of every second keypoint, or fewer."""
 
 UNUSUAL_PRINCIPAL_SHARE, UNUSUAL_ASPECT = 0.1, 0.03
 """Distance of the principal point from the centre, as a share of the width, from which the centre is tried too; share
