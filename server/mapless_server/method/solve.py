@@ -10,9 +10,9 @@ from .bundle.estimate import PosedSupport, Support, with_halves
 from .bundle.pose_problem import AdjustInput
 from .features.views import Reconstruction
 from .judge.answer import Answer, Localization
+from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
 from .judge.hypothesis import Attempt, Doubt, Found, Solver, doubt_of, found_by
-from .judge.intrinsics import intrinsics_checks
 from .judge.judge import contradiction, judge, one_reference_failure, trust_of_score
 from .judge.references import unmoved_failure
 from .judge.two_view import (

@@ -25,9 +25,8 @@ from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.features.views import View, undistort_pixels
 from mapless_server.method.judge import cameras
 from mapless_server.method.judge.answer import Answer
-from mapless_server.method.judge.cameras import wrong_camera
+from mapless_server.method.judge.cameras import intrinsics_checks, wrong_camera, wrong_intrinsics
 from mapless_server.method.judge.hints import hinted
-from mapless_server.method.judge.intrinsics import intrinsics_checks, wrong_intrinsics
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.structure.model import PointMatches
 

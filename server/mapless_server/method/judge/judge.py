@@ -39,9 +39,8 @@ from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.one_reference import Found
 from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
-from .cameras import wrong_camera
+from .cameras import wrong_camera, wrong_intrinsics
 from .evidence import MAJORITY, Evidence, Votes, evidence_of, votes_of
-from .intrinsics import wrong_intrinsics
 from .references import disagreeing_references, supporters_of
 
 RIVAL_MIN_KEYPOINTS = 10
