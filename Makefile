@@ -33,7 +33,7 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check $(LOCKED) uv
 	$(INSTALL) $(LOCKED) $(TORCH)
-	$(INSTALL) $(LOCKED) --editable '.[server,tools,networks,otel,postgres,ray,view,gateway,dev]'
+	$(INSTALL) $(LOCKED) --editable '.[server,tools,networks,otel,postgres,ray,view,gateway,reconstruct,dev]'
 	$(INSTALL) --no-deps --target $(VENV)/kapture $(KAPTURE)
 	touch $@
 

@@ -5,12 +5,15 @@ from importlib.util import find_spec
 from mapless_command.installation import how_to_install
 
 _EXTRA_OF = {
+    "av": "reconstruct",
     "huggingface_hub": "networks",
     "jinja2": "tools",
     "kornia": "networks",
     "matplotlib": "tools",
     "opentelemetry": "otel",
     "PIL": "networks",
+    "pillow_heif": "reconstruct",
+    "pycolmap": "reconstruct",
     "python_multipart": "gateway",
     "rosbags": "tools",
     "starlette": "gateway",
