@@ -11,7 +11,6 @@ _EXTRA_OF = {
     "kornia": "networks",
     "matplotlib": "tools",
     "opentelemetry": "otel",
-    "PIL": "networks",
     "pillow_heif": "reconstruct",
     "pycolmap": "reconstruct",
     "python_multipart": "gateway",

@@ -20,9 +20,9 @@ from mapless.geodesy import GeoPose, pose_from_geopose
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits
 from mapless_server.images.decode import image_size
+from mapless_server.images.exif import focal_of, read_exif
 from mapless_tools.ingest.formats.colmap.cameras import PARAMETERS, ColmapCamera
 
-from .exif import focal_of
 from .guard import Failure, checked_json
 from .messages import CameraParameters, CameraReading, GeolocationReading, Request, Response
 
@@ -185,7 +185,7 @@ def _camera_of(
     model = given.model.upper() if given is not None else _UNKNOWN_MODEL
     if given is None or (model.startswith(_UNKNOWN_MODEL) and not given.modelParams):
         try:
-            focal = focal_of(image, width_px, height_px)
+            focal = focal_of(read_exif(image), width_px, height_px)
         except ValueError as error:
             raise Failure(str(error), field=f"{where}.model") from None
         if focal is None:

@@ -1,4 +1,4 @@
-"""Focal lengths by EXIF: zoom, crops in the camera, resized and cut files, and what is no focal length."""
+"""EXIF: focal lengths, zoom, crops, resized and cut files, the way up, the place, and values that are none."""
 
 import io
 import math
@@ -8,7 +8,7 @@ import pytest
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
-from mapless_tools.gateway.exif import ExifFocal, focal_of
+from mapless_server.images.exif import NO_EXIF, ExifFocal, GpsPosition, focal_of, read_exif
 
 DIAGONAL_MM = math.hypot(36, 24)
 WHOLE = 28 / DIAGONAL_MM * 500
@@ -24,7 +24,7 @@ def found(size: tuple[int, int], maker: str = "", **tags: Any) -> ExifFocal | No
         about[ExifTags.Base[name]] = value
     out = io.BytesIO()
     Image.new("RGB", size).save(out, "JPEG", exif=exif)
-    return focal_of(out.getvalue(), *size)
+    return focal_of(read_exif(out.getvalue()), *size)
 
 
 def px(size: tuple[int, int], maker: str = "", **tags: Any) -> float:
@@ -71,3 +71,42 @@ def test_a_file_that_a_program_has_cut_is_refused() -> None:
 def test_a_focal_length_that_is_none_is_not_used(film: int) -> None:
     assert found((400, 300), FocalLengthIn35mmFilm=film) is None
     assert found((400, 300)) is None
+
+
+def of(gps: dict[str, Any], **tags: Any) -> bytes:
+    exif = Image.Exif()
+    for name, value in tags.items():
+        exif[ExifTags.Base[name]] = value
+    about = exif.get_ifd(ExifTags.IFD.GPSInfo)
+    for name, value in gps.items():
+        about[ExifTags.GPS[name]] = value
+    out = io.BytesIO()
+    Image.new("RGB", (40, 30)).save(out, "JPEG", exif=exif)
+    return out.getvalue()
+
+
+def test_south_west_below_the_sea_is_negative() -> None:
+    gps = {"GPSLatitude": (33.0, 30.0, 36.0), "GPSLatitudeRef": "S", "GPSLongitude": (70.0, 0.0, 0.0)}
+    gps |= {"GPSLongitudeRef": "W", "GPSAltitude": 12.5, "GPSAltitudeRef": b"\x01", "GPSHPositioningError": 4.5}
+    found = read_exif(of(gps)).position
+    assert found == GpsPosition(pytest.approx(-33.51), -70.0, -12.5, 4.5)
+
+
+@pytest.mark.parametrize("latitude", [(0.0, 0.0, 0.0), (91.0, 0.0, 0.0), (IFDRational(0, 0), 0.0, 0.0), (1.0, 2.0)])
+def test_an_impossible_position_is_none(latitude: Any) -> None:
+    gps = {"GPSLatitude": latitude, "GPSLatitudeRef": "N", "GPSLongitude": (0.0, 0.0, 0.0), "GPSLongitudeRef": "E"}
+    assert read_exif(of(gps)).position is None
+
+
+@pytest.mark.parametrize(("written", "read"), [(1, 1), (6, 6), (8, 8), (0, 1), (9, 1)])
+def test_orientations_other_than_eight_are_upright(written: int, read: int) -> None:
+    assert read_exif(of({}, Orientation=written)).orientation == read
+
+
+def test_texts_have_no_control_characters() -> None:
+    assert read_exif(of({}, Make="Acme\x1b[2J  ", Model="One\0")).make == "Acme[2J"
+
+
+@pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", b"GIF89a", of({}, Make="A" * 500)[:80]])
+def test_files_without_exif_say_nothing(data: bytes) -> None:
+    assert read_exif(data) == NO_EXIF
