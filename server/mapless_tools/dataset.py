@@ -17,7 +17,10 @@ from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.scenes import Vector, unit_vector
 from mapless.text_files import read_text
-from mapless_server.images import ImageLimits, decode_mask
+from mapless_server.images import ImageLimits, decode_image, decode_mask, upright_of
+from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.extractors.turned import extract_upright
+from mapless_server.method.features.views import View
 
 MAX_NAME_LENGTH = 128
 SPLITS = ("", "train", "test")
@@ -46,6 +49,12 @@ class Frame:
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
             raise ValueError(f"split must be one of {', '.join(map(repr, SPLITS))}, not {self.split!r}")
+
+    def described(self, extractor: FeatureExtractor, limits: ImageLimits) -> View:
+        """The photograph's view, as the server makes it; InvalidArgument or OSError if image or mask are bad."""
+        data = self.image_path.read_bytes()
+        pixels, upright_deg = decode_image(data, limits), upright_of(data).clockwise_deg
+        return extract_upright(extractor, pixels, self.camera, upright_deg, ignored=self.read_ignored())
 
     def read_ignored(self) -> NDArray[np.bool_] | None:
         """The ignored pixels, (H, W); None if all are used. InvalidArgument or OSError if the mask is bad."""

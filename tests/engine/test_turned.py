@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from support.compare import pose_error
 from support.corner import CAMERA, photograph, pose
-from support.images import encode, textured
+from support.images import encode, textured, with_exif_orientation
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.engine import choosing
@@ -23,7 +23,7 @@ from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import MIRROR, Caller, Photo, Query, Result, Tier
 from mapless_server.engine.search import Material, Search
-from mapless_server.images import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image, upright_of
 from mapless_server.method.bundle.priors import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.extractors.turned import extract_turned
@@ -71,17 +71,31 @@ def tiers() -> list[Tier]:
     return [Tier(UprightSift(), Pipeline()), Tier(SiftExtractor(), Pipeline(), any_roll=True)]
 
 
+@dataclass(frozen=True)
+class Shot:
+    """A photograph with its pose."""
+
+    photo: Photo
+    world_from_camera: RigidTransform
+
+
+SHOTS = [Shot(Photo(photograph(it), CAMERA, "image"), it) for it in REFERENCE_POSES]
+
+
 @contextmanager
-def localizing(folder: Path, tiers: Sequence[Tier], doubtful_trust: float = 0.25) -> Iterator[Localize]:
+def localizing(
+    folder: Path, tiers: Sequence[Tier], doubtful_trust: float = 0.25, shots: Sequence[Shot] = SHOTS
+) -> Iterator[Localize]:
     caller, loop = Caller(Flow("tenant", "client"), time.monotonic() + 600), asyncio.new_event_loop()
     with Store.open(folder) as store:
         options = EngineOptions(doubt=DoubtOptions(doubtful_trust))
         engine = engine_over(store, tiers, options)
-        photos = [Photo(photograph(it), CAMERA, "image") for it in REFERENCE_POSES]
-        described = loop.run_until_complete(engine.describe(photos, caller))
+        described = loop.run_until_complete(engine.describe([it.photo for it in shots], caller))
         store.create_scene(SCENE)
-        shown = zip(NAMED, photos, REFERENCE_POSES, described, strict=True)
-        references = [NewReference(i, p.image, CAMERA, at, it.views, it.descriptors) for i, p, at, it in shown]
+        references = [
+            NewReference(name, it.photo.image, it.photo.camera, it.world_from_camera, found.views, found.descriptors)
+            for name, it, found in zip(NAMED, shots, described, strict=True)
+        ]
         store.add_references(SCENE, references)
 
         def answer(
@@ -100,7 +114,9 @@ def localizing(folder: Path, tiers: Sequence[Tier], doubtful_trust: float = 0.25
     loop.close()
 
 
-def rolled(image: NDArray[np.uint8], angle_deg: float) -> tuple[NDArray[np.uint8], Camera, RigidTransform]:
+def rolled(
+    image: NDArray[np.uint8], angle_deg: float, world_from_camera: RigidTransform = TRUE
+) -> tuple[NDArray[np.uint8], Camera, RigidTransform]:
     """The photograph turned clockwise about its centre, all of it on black, with its camera and pose."""
     cos, sin = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     turn, sides = np.array([[cos, -sin], [sin, cos]]), np.array([CAMERA.width_px, CAMERA.height_px])
@@ -112,7 +128,43 @@ def rolled(image: NDArray[np.uint8], angle_deg: float) -> tuple[NDArray[np.uint8
     camera = replace(CAMERA, width_px=width, height_px=height, principal_x_px=float(x), principal_y_px=float(y))
     old_from_turned = np.eye(3)
     old_from_turned[:2, :2] = turn.T
-    return np.asarray(turned, np.uint8), camera, RigidTransform(TRUE.rotation @ old_from_turned, TRUE.translation)
+    rotation = world_from_camera.rotation @ old_from_turned
+    return np.asarray(turned, np.uint8), camera, RigidTransform(rotation, world_from_camera.translation)
+
+
+def held(world_from_camera: RigidTransform, orientation: int) -> Shot:
+    """A photograph that is upright once a viewer has turned it as this EXIF orientation asks."""
+    data = with_exif_orientation(encode(".jpg", textured(64, 64)), orientation)
+    upright = decode_image(photograph(world_from_camera), ImageLimits())
+    image, camera, pose = rolled(upright, -upright_of(data).clockwise_deg, world_from_camera)
+    stored = np.ascontiguousarray(image[:, ::-1]) if upright_of(data).is_mirrored else image
+    return Shot(Photo(with_exif_orientation(encode(".jpg", stored), orientation), camera, "image"), pose)
+
+
+@pytest.fixture(scope="module")
+def localize_held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Localize]:
+    shots = [held(it, 1 + i % 8) for i, it in enumerate(REFERENCE_POSES)]
+    with localizing(tmp_path_factory.mktemp("store"), tiers(), shots=shots) as answer:
+        yield answer
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photographs_match_whichever_way_they_are_held(localize_held: Localize, orientation: int) -> None:
+    shot = held(TRUE, orientation)
+    result = localize_held(shot.photo.image, shot.photo.camera)
+    assert isinstance(result.answer.outcome, Localization)
+    off_m, off_deg = pose_error(result.answer.outcome.world_from_camera, shot.world_from_camera)
+    assert off_m < 0.01
+    assert off_deg < 0.2
+    assert len(result.attempts) == 1
+
+
+def test_a_false_orientation_costs_a_rung_and_no_answer(localize_held: Localize) -> None:
+    shot = held(TRUE, 1)
+    result = localize_held(with_exif_orientation(shot.photo.image, 8), shot.photo.camera)
+    assert isinstance(result.answer.outcome, Localization)
+    assert pose_error(result.answer.outcome.world_from_camera, TRUE)[0] < 0.01
+    assert len(result.attempts) > 1
 
 
 @pytest.mark.parametrize(
@@ -215,12 +267,15 @@ def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:
     assert any(stage.endswith(MIRROR) for stage in result.stage_seconds)
 
 
-@pytest.mark.parametrize("angle_deg", [90.0, 215.0])
-def test_a_gravity_prior_shows_how_to_turn_where_matches_do_not(tmp_path: Path, angle_deg: float) -> None:
+@pytest.mark.parametrize(("angle_deg", "orientation"), [(90.0, 1), (215.0, 1), (90.0, 6), (215.0, 8)])
+def test_a_gravity_prior_shows_how_to_turn_where_matches_do_not(
+    tmp_path: Path, angle_deg: float, orientation: int
+) -> None:
+    shots = [held(it, orientation) for it in REFERENCE_POSES]
     image, camera, true = rolled(decode_image(photograph(TRUE), ImageLimits()), angle_deg)
     down = np.array([0.0, 1.0, 0.0])
     prior = GravityPrior(true.rotation.T @ down, down, 2.0)
-    with localizing(tmp_path, tiers()[:1]) as answer:
+    with localizing(tmp_path, tiers()[:1], shots=shots) as answer:
         result = answer(encode(".png", image), camera, priors=Priors(gravity=prior))
     outcome = result.answer.outcome
     assert isinstance(outcome, Localization)

@@ -4,11 +4,13 @@ import io
 import math
 from typing import Any
 
+import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 from PIL.TiffImagePlugin import IFDRational
+from support.images import encode, textured, with_exif_orientation
 
-from mapless_server.images.exif import NO_EXIF, ExifFocal, GpsPosition, focal_of, read_exif
+from mapless_server.images.exif import NO_EXIF, ExifFocal, GpsPosition, Upright, focal_of, read_exif, upright_of
 
 DIAGONAL_MM = math.hypot(36, 24)
 WHOLE = 28 / DIAGONAL_MM * 500
@@ -110,3 +112,22 @@ def test_texts_have_no_control_characters() -> None:
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8\xff", b"GIF89a", of({}, Make="A" * 500)[:80]])
 def test_files_without_exif_say_nothing(data: bytes) -> None:
     assert read_exif(data) == NO_EXIF
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_upright_is_what_viewers_show(orientation: int) -> None:
+    data = with_exif_orientation(encode(".jpg", textured(40, 30)), orientation)
+    found = upright_of(data)
+    with Image.open(io.BytesIO(data)) as opened:
+        stored, shown = np.asarray(opened), np.asarray(ImageOps.exif_transpose(opened))
+    unmirrored = stored[:, ::-1] if found.is_mirrored else stored
+    np.testing.assert_array_equal(np.rot90(unmirrored, -round(found.clockwise_deg / 90)), shown)
+
+
+@pytest.mark.parametrize("ending", [".png", ".webp"])
+def test_all_formats_say_which_way_is_up(ending: str) -> None:
+    exif, out = Image.Exif(), io.BytesIO()
+    exif[ExifTags.Base.Orientation] = 8
+    Image.new("RGB", (40, 30)).save(out, ending[1:], exif=exif)
+    assert upright_of(out.getvalue()) == Upright(clockwise_deg=270.0)
+    assert upright_of(encode(ending, textured(40, 30))) == Upright()

@@ -38,12 +38,12 @@ def test_2048_keypoints_take_the_bytes_that_are_promised(dimension: int, most: i
 
 
 @pytest.mark.parametrize("is_histogram", [False, True])
-@pytest.mark.parametrize("count", [0, 1, 500])
-def test_small_features_come_back(count: int, is_histogram: bool) -> None:
-    view = View(CAMERA, small_features(2, count, 64, is_histogram))
+@pytest.mark.parametrize(("count", "upright_deg"), [(0, 0.0), (1, 270.0), (500, 0.0)])
+def test_small_features_come_back(count: int, upright_deg: float, is_histogram: bool) -> None:
+    view = View(CAMERA, small_features(2, count, 64, is_histogram), upright_deg=upright_deg)
     blob = codec.encode_view(view)
     again = codec.decode_view("o", blob, codec.sha256_for("o", blob))
-    assert again.camera == view.camera
+    assert (again.camera, again.upright_deg) == (view.camera, upright_deg)
     assert_same_bits(again.features.descriptors, view.features.descriptors)
     np.testing.assert_allclose(again.features.keypoints, view.features.keypoints, rtol=0, atol=2**-14)
     np.testing.assert_allclose(again.features.sizes_px, view.features.sizes_px, rtol=5e-4)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
+from support.images import encode, textured, with_exif_orientation
 from support.stores import EXTRACTOR, Place, Shared, faults_of, make_reference
 
 from mapless.geometry import Camera
@@ -73,6 +74,19 @@ def assert_all_is_there(store: Store, release: str) -> None:
         assert store.read_image(OFFICE, reference_id) == bytes([number]) * 8
         has_mask = release != "0.2.0" and reference_id == "c"
         assert store.read_mask_of(found.record.key) == (b"mask" if has_mask else b"")
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_photographs_that_exif_turns_are_described_again(place: Place, release: str) -> None:
+    make_store_of(release, place)
+    photograph = with_exif_orientation(encode(".jpg", textured(64, 48)), 6)
+    (key,) = place.fetch("SELECT key FROM reference WHERE reference_id = 'b'")[0]
+    place.execute("UPDATE image SET data = ? WHERE reference_key = ?", photograph, key)
+    with place.open() as store:
+        found = store.load_references(OFFICE, None, EXTRACTOR)
+        assert [it.record.reference_id for it in found.references] == ["a", "c"]
+        assert [it.reference_id for it in found.undescribed] == ["b"]
+        assert [it.reference_id for it in store.list_changes(OFFICE, 0, "vlad").added if it.descriptor is None] == ["b"]
 
 
 @pytest.mark.parametrize("start", ["nothing", *RELEASES])

@@ -124,6 +124,7 @@ def _rasters_by(search: Search, material: Material, found: Sequence[Similarity |
         The angles, degrees; empty if references are upright in the photograph as it is, or nothing shows that.
     """
     references = material.references
+    by_exif = [it.view.upright_deg - material.view.upright_deg for it in references]
     shown = [it if it is not None and it.agreement >= LEAST_AGREEMENT else None for it in found]
     counts = [it.agreeing if it else 0 for it in shown]
     best = int(np.argmax(counts))
@@ -131,13 +132,18 @@ def _rasters_by(search: Search, material: Material, found: Sequence[Similarity |
         world_from_query = references[best].world_from_camera.rotation @ roll_about_axis(roll.clockwise_deg)
         by_pose = (roll_of_rotation(it.world_from_camera.rotation.T @ world_from_query) for it in references)
         rolls = [it.clockwise_deg if it else other for it, other in zip(shown, by_pose, strict=True)]
-        rasters = rasters_of(rolls, counts)
+        rasters = rasters_of(_added(rolls, by_exif), counts)
         return search.angles_deg if are_alike(rasters, search.angles_deg) else rasters
-    return search.angles_deg or rasters_of(_rolls_by_priors(search, references))
+    return search.angles_deg or rasters_of(_added(_rolls_by_priors(search, references), by_exif))
+
+
+def _added(rolls_deg: Sequence[float | None], by_exif: Sequence[float]) -> list[float | None]:
+    """The rolls of upright rasters by those of rasters as they are stored."""
+    return [None if roll is None else roll + more for roll, more in zip(rolls_deg, by_exif, strict=True)]
 
 
 def _rolls_by_priors(search: Search, references: Sequence[PosedView]) -> list[float | None]:
-    """The rolls that a prior on pose or gravity shows, of those references where it does."""
+    """The rolls against references that a prior on pose or gravity shows, None where it does not."""
     pose, gravity = search.query.priors.pose, search.query.priors.gravity
     rolls: list[float | None] = []
     for it in references:
@@ -146,6 +152,8 @@ def _rolls_by_priors(search: Search, references: Sequence[PosedView]) -> list[fl
             rolls.append(roll_of_rotation(reference_from_world @ pose.world_from_camera.rotation))
         elif gravity is not None:
             rolls.append(roll_of_directions(gravity.in_camera, reference_from_world @ gravity.in_world))
+        else:
+            rolls.append(None)
     return rolls
 
 

@@ -6,10 +6,11 @@ import hashlib
 import math
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
-from mapless_server.images import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, decode_image, upright_of
 from mapless_server.method.features.extractors import FeatureExtractor, Mirrors
-from mapless_server.method.features.extractors.turned import extract_turned
+from mapless_server.method.features.extractors.turned import extract_upright
 from mapless_server.method.features.views import Photograph, View, reduce_image
 from mapless_server.method.options import StageContext
 
@@ -21,8 +22,8 @@ class RasterForm:
     """The raster in which features of a photograph are found.
 
     Attributes:
-        angles_deg: the raster is turned clockwise by each of these; pixels of the features are of the photograph as it
-            is. Empty if it is not turned.
+        angles_deg: the raster that is upright by the photograph's EXIF is turned clockwise by each of these; pixels of
+            the features are of the photograph as it is stored. Empty if it is not turned any further.
         max_pixels: about so many at most; None for all.
         is_mirrored: whether descriptors are those of the mirror image: such a view can be matched, but has no pose.
     """
@@ -39,6 +40,11 @@ class _Decoded:
         self.views: dict[tuple[str, RasterForm], View] = {}
         self._photo, self._limits = photo, limits
         self._photograph: Photograph | None = None
+
+    @cached_property
+    def upright_deg(self) -> float:
+        """By how much the raster has to be turned clockwise to be upright by the photograph's EXIF."""
+        return upright_of(self._photo.image).clockwise_deg
 
     def read(self, context: StageContext) -> Photograph:
         """The photograph; InvalidArgument if it is bad."""
@@ -80,19 +86,19 @@ class QueryViews:
         if key not in known:
             photograph = self._decoded.read(context)
             with context.stage("features"):
-                known[key] = replace(_extracted(extractor, photograph, self.form), photograph=photograph)
+                known[key] = replace(self._extracted(extractor, photograph), photograph=photograph)
         return known[key]
+
+    def _extracted(self, extractor: FeatureExtractor, photograph: Photograph) -> View:
+        pixels, camera, ignored = photograph.read(), photograph.camera, photograph.read_ignored()
+        if (most := self.form.max_pixels) is not None:
+            share = min(1.0, math.sqrt(most / (camera.width_px * camera.height_px)))
+            pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
+        upright_deg = self._decoded.upright_deg
+        if not upright_deg and not self.form.angles_deg:
+            return extractor.extract(pixels, camera, ignored)
+        return extract_upright(extractor, pixels, camera, upright_deg, self.form.angles_deg, ignored)
 
     def ignored_share(self, context: StageContext) -> float:
         """Share of the pixels that its mask ignores, 0 to 1; InvalidArgument if image or mask is bad."""
         return self._decoded.read(context).ignored_share
-
-
-def _extracted(extractor: FeatureExtractor, photograph: Photograph, form: RasterForm) -> View:
-    pixels, camera, ignored = photograph.read(), photograph.camera, photograph.read_ignored()
-    if form.max_pixels is not None:
-        share = min(1.0, math.sqrt(form.max_pixels / (camera.width_px * camera.height_px)))
-        pixels, camera = reduce_image(pixels, camera, round(share * max(camera.width_px, camera.height_px)))
-    if form.angles_deg:
-        return extract_turned(extractor, pixels, camera, form.angles_deg, ignored)
-    return extractor.extract(pixels, camera, ignored)

@@ -4,4 +4,5 @@ Imports only `mapless_server.errors`. Begin with `decode`.
 """
 
 from .decode import ANY_SIZE, ImageLimits, decode_image, image_size
+from .exif import Upright, upright_of
 from .masks import check_mask, decode_mask

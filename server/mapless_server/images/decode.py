@@ -5,7 +5,7 @@ can claim 900 megapixels. Only JPEG, PNG and WebP are accepted, by their first b
 more formats than have been hardened.
 
 Pixels are returned as the file stores them. EXIF orientation is meant for viewers; intrinsics and poses refer to the
-sensor.
+sensor. Only the columns of a raster that is mirrored by its EXIF are reversed: no camera with a pose sees such a one.
 """
 
 import re
@@ -20,6 +20,7 @@ from mapless.deep_pixels import eight_bits
 from mapless.pixels import JPEG_FRAMES, BadHeader, size_of_image
 from mapless_server.errors import InvalidArgument
 
+from .exif import upright_of
 from .png_chunks import essential_png
 
 # IMREAD_UNCHANGED would also ignore the orientation, but keeps alpha. Asked for colour, the decoder drops alpha,
@@ -90,13 +91,15 @@ def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[
 def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDArray[np.uint8]:
     """Pixels of an image, (H, W, 3) RGB, as the file stores them: EXIF orientation is not applied.
 
-    Those of 16 bits are stretched to 8, see `mapless.deep_pixels`.
+    The columns are reversed where it says that they are mirrored. Pixels of 16 bits are stretched to 8, see
+    `mapless.deep_pixels`.
 
     InvalidArgument as of `image_size`, or if the decoder cannot read the file to its end.
     """
     width, height = image_size(data, limits, field)
     if data.startswith(b"\xff\xd8") and _has_many_scans(data):
         raise InvalidArgument("the JPEG has too many scans", reason="IMAGE_TOO_COMPLEX", field=field)
+    is_mirrored = upright_of(data).is_mirrored
     if data.startswith(_PNG):
         data = essential_png(data, field)
     pixels = _decoded(data)
@@ -112,7 +115,8 @@ def decode_image(data: bytes, limits: ImageLimits, field: str = "image") -> NDAr
             reason="IMAGE_UNDECODABLE",
             field=field,
         )
-    return eight_bits(pixels) if pixels.dtype == np.uint16 else np.asarray(pixels, np.uint8)
+    pixels = eight_bits(pixels) if pixels.dtype == np.uint16 else np.asarray(pixels, np.uint8)
+    return np.ascontiguousarray(pixels[:, ::-1]) if is_mirrored else pixels
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:

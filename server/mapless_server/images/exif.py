@@ -19,7 +19,9 @@ from typing import Any
 
 from PIL import ExifTags, Image
 
-_FORMATS = ("JPEG", "MPO", "PNG", "WEBP")
+_FORMATS = ("JPEG", "PNG", "WEBP")
+_DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, struct.error, Image.DecompressionBombError)
+"""What Pillow raises for files whose header or EXIF it cannot read."""
 _MAX_TEXT = 200
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _FILM_MM = (5.0, 1000.0)
@@ -72,6 +74,26 @@ NO_EXIF = Exif()
 
 
 @dataclass(frozen=True)
+class Upright:
+    """How a stored raster becomes upright: its columns are reversed if it is mirrored, then it is turned clockwise."""
+
+    is_mirrored: bool = False
+    clockwise_deg: float = 0.0
+
+
+_UPRIGHT = {
+    2: Upright(is_mirrored=True),
+    3: Upright(clockwise_deg=180.0),
+    4: Upright(is_mirrored=True, clockwise_deg=180.0),
+    5: Upright(is_mirrored=True, clockwise_deg=270.0),
+    6: Upright(clockwise_deg=90.0),
+    7: Upright(is_mirrored=True, clockwise_deg=90.0),
+    8: Upright(clockwise_deg=270.0),
+}
+"""By EXIF's orientation; as it is for all others."""
+
+
+@dataclass(frozen=True)
 class ExifFocal:
     """A focal length of a raster with its standard deviation, pixels."""
 
@@ -82,10 +104,25 @@ class ExifFocal:
 def read_exif(image: bytes) -> Exif:
     """Reads the EXIF of a JPEG, PNG or WebP file; damaged EXIF, or that of another format, is as none."""
     try:
-        with Image.open(io.BytesIO(image), formats=_FORMATS) as opened:
-            return exif_of(opened.getexif())
-    except (OSError, SyntaxError, ValueError, TypeError, KeyError, struct.error, Image.DecompressionBombError):
+        return exif_of(_tags(image))
+    except _DAMAGED:
         return NO_EXIF
+
+
+def upright_of(image: bytes) -> Upright:
+    """How a JPEG, PNG or WebP file becomes upright by its EXIF; as it is without, or with damaged EXIF."""
+    try:
+        return _UPRIGHT.get(_tags(image).get(ExifTags.Base.Orientation, 1), Upright())
+    except _DAMAGED:
+        return Upright()
+
+
+def _tags(image: bytes) -> Image.Exif:
+    """The tags of a file; those of a PNG are read only where they precede the pixels, which would be decoded."""
+    with Image.open(io.BytesIO(image), formats=_FORMATS) as opened:
+        if opened.format == "PNG" and "exif" not in opened.info:
+            return Image.Exif()
+        return opened.getexif()
 
 
 def exif_of(tags: Image.Exif) -> Exif:

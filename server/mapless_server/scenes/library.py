@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 
 from mapless.names import reference_name
 from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, RequestError, Unavailable
-from mapless_server.images import ANY_SIZE, decode_image, decode_mask
+from mapless_server.images import ANY_SIZE, decode_image, decode_mask, upright_of
 from mapless_server.method.features.extractors import FeatureExtractor
+from mapless_server.method.features.extractors.turned import extract_upright
 from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
 from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
@@ -179,7 +181,9 @@ class ReferenceLibrary:
 
     def extract(self, record: ReferenceRecord, extractor: FeatureExtractor) -> View:
         """Finds features in the stored photograph; NotFound if the reference was deleted, DataLoss if it is damaged."""
-        return extractor.extract(self._pixels(record), record.camera, self._ignored(record))
+        data = self._store.read_image_of(record.key)
+        pixels, ignored = self._decoded(record, data), self._ignored(record)
+        return extract_upright(extractor, pixels, record.camera, upright_of(data).clockwise_deg, ignored=ignored)
 
     def posed_view(self, reference: DescribedReference) -> PosedView:
         """A stored reference as the pipeline needs it; its photograph is read when its pixels are first used."""
@@ -189,13 +193,15 @@ class ReferenceLibrary:
         return PosedView(
             record.key,
             reference_name(record.scene_id, record.reference_id),
-            View(view.camera, view.features, photograph),
+            replace(view, photograph=photograph),
             record.world_from_camera,
         )
 
     def _pixels(self, record: ReferenceRecord) -> NDArray[np.uint8]:
         """Reads the photograph, (H, W, 3) RGB; NotFound if the reference was deleted, DataLoss if it is damaged."""
-        data = self._store.read_image_of(record.key)
+        return self._decoded(record, self._store.read_image_of(record.key))
+
+    def _decoded(self, record: ReferenceRecord, data: bytes) -> NDArray[np.uint8]:
         try:
             return decode_image(data, ANY_SIZE)
         except InvalidArgument as error:

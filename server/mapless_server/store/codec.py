@@ -5,7 +5,7 @@ view is one blob:
 
     byte 0       format version
     bytes 4..8   length of the header, uint32
-    header       JSON (camera, count, dimension), padded with spaces so that the arrays are aligned
+    header       JSON (camera, count, dimension, upright_deg unless 0), padded with spaces: the arrays are aligned
     arrays       keypoints (N, 2), sizes (N,), descriptors (N, D)
 
 In format 1 the arrays are float32. In format 2 descriptors have 8 bits, keypoints are 24-bit multiples of the header's
@@ -171,6 +171,8 @@ def _encode_small_view(view: View) -> bytes:
 
 def _blob(version: int, view: View, how: dict[str, Any], arrays: Sequence[NDArray[Any]]) -> bytes:
     count, dimension = view.features.descriptors.shape
+    if view.upright_deg:
+        how = how | {"upright_deg": view.upright_deg}
     header = _to_json({"camera": _camera_to_dict(view.camera), "count": count, "dimension": dimension} | how)
     header += b" " * (-(_PREFIX.size + len(header)) % _ALIGNMENT_BYTES)
     return b"".join([_PREFIX.pack(version, len(header)), header, *(array.tobytes() for array in arrays)])
@@ -189,11 +191,12 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
         header = json.loads(blob[_PREFIX.size : offset])
         count, dimension = header["count"], header["dimension"]
         if version == SMALL_VIEW_FORMAT_VERSION:
-            return View(_camera_from_dict(header["camera"]), _small_features(blob[offset:], header, count, dimension))
-        floats = np.frombuffer(blob, _FLOAT32, offset=offset)
-        keypoints, sizes_px, descriptors = np.split(floats, [2 * count, 3 * count])
-        features = Features(keypoints.reshape(count, 2), descriptors.reshape(count, dimension), sizes_px)
-        return View(_camera_from_dict(header["camera"]), features)
+            features = _small_features(blob[offset:], header, count, dimension)
+        else:
+            floats = np.frombuffer(blob, _FLOAT32, offset=offset)
+            keypoints, sizes_px, descriptors = np.split(floats, [2 * count, 3 * count])
+            features = Features(keypoints.reshape(count, 2), descriptors.reshape(count, dimension), sizes_px)
+        return View(_camera_from_dict(header["camera"]), features, upright_deg=header.get("upright_deg", 0.0))
 
 
 def _small_features(body: bytes, header: dict[str, Any], count: int, dimension: int) -> Features:

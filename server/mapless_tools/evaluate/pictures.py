@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, cross_matrix
-from mapless_server.images import decode_image
 from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.views import View
 from mapless_tools.dataset import Frame
@@ -117,7 +116,7 @@ class _Shown:
     @staticmethod
     def of(frame: Frame, matcher: Matcher) -> "_Shown":
         data = frame.image_path.read_bytes()
-        view = matcher.extractor.extract(decode_image(data, matcher.limits), frame.camera, frame.read_ignored())
+        view = frame.described(matcher.extractor, matcher.limits)
         pixels = frame.camera.project(view.camera.rays(view.features.keypoints))
         shot = Shot.of(data, frame.camera, MAX_SIDE_PX)
         return _Shown(frame, view, shot, shot.pixels_of(pixels, frame.camera))

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ImageLimits, decode_image, image_size
+from mapless_server.images import ImageLimits, image_size
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.matching import OPTIONS, CorrespondOptions, mutual_matches
 from mapless_server.method.features.views import PosedView, View
@@ -86,8 +86,7 @@ def rank_by_matches(
 
     def view_of(frame: Frame) -> View:
         try:
-            image = decode_image(frame.image_path.read_bytes(), matcher.limits)
-            return matcher.extractor.extract(image, frame.camera, frame.read_ignored())
+            return frame.described(matcher.extractor, matcher.limits)
         except InvalidArgument as error:
             raise UsageError(f"{frame.image_path}: {error}") from error
 

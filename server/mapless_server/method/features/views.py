@@ -134,12 +134,15 @@ class View:
         photograph: the image itself; None if no stage needs it.
         distortion: distortion of the lens, which was removed from the keypoints; None for a pinhole, and for stored
             references, where it is not needed.
+        upright_deg: by how much the raster was turned clockwise to be upright by its EXIF before features were found;
+            their pixels are of the raster that is not turned.
     """
 
     camera: Camera
     features: Features
     photograph: Photograph | None = None
     distortion: Distortion | None = None
+    upright_deg: float = 0.0
 
     def cells(self, columns: int) -> NDArray[np.int32]:
         """Indices (N,) of the keypoints' cells, row by row, in a grid of so many columns; see `grid_shape`.

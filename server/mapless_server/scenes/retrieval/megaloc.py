@@ -92,14 +92,15 @@ class MegaLocDescriptor:
 
 
 def _picture(view: View) -> Tensor:
-    """Resizes the photograph to a square (3, SIDE_PX, SIDE_PX), float32 in [0, 1]: bilinear with antialiasing.
+    """Resizes the upright photograph to a square (3, SIDE_PX, SIDE_PX), float32 in [0, 1]: bilinear with antialiasing.
 
     It is resized horizontally first, some rows at a time, then vertically. Both at once give the same bits in three
     times the time, and need a float copy of the whole photograph, four times its size.
     """
     if view.photograph is None:
         raise ValueError("MegaLoc uses pixels, and the view has no photograph")
-    pixels = torch.from_numpy(np.ascontiguousarray(view.photograph.read())).permute(2, 0, 1)[None]
+    upright = np.rot90(view.photograph.read(), -round(view.upright_deg / 90))
+    pixels = torch.from_numpy(np.ascontiguousarray(upright)).permute(2, 0, 1)[None]
     bands = [_resized(band.float(), (band.shape[2], SIDE_PX)) for band in pixels.split(_BAND_ROWS, dim=2)]
     return _resized(torch.cat(bands, dim=2), (SIDE_PX, SIDE_PX))[0] / 255
 

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ImageLimits, decode_image
+from mapless_server.images import ImageLimits, image_size
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.pairs.readings.errors import MatchedPair, Pair, consistent, distinct_matches
@@ -59,12 +59,11 @@ class Comparison:
     def _view(self, index: int) -> PosedView | None:
         frame = self.frames[index]
         try:
-            image, ignored = decode_image(frame.image_path.read_bytes(), LIMITS), frame.read_ignored()
+            if image_size(frame.image_path.read_bytes(), LIMITS) != (frame.camera.width_px, frame.camera.height_px):
+                return None
+            view = frame.described(self.extractor, LIMITS)
         except (OSError, InvalidArgument):
             return None
-        if image.shape[:2] != (frame.camera.height_px, frame.camera.width_px):
-            return None
-        view = self.extractor.extract(image, frame.camera, ignored)
         return PosedView(str(index), frame.name, view, frame.world_from_camera)
 
     def _posed(self, index: int) -> PosedView:

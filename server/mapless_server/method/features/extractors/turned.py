@@ -1,6 +1,7 @@
 """Features of a photograph whose raster is turned: learned features describe what is upright, and match no others."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -12,6 +13,24 @@ from mapless.geometry import Array, Camera
 from ..limits import MAX_SIDE_PX
 from ..views import Features, Ignored, View, reduce_image, view_of
 from . import FeatureExtractor
+
+
+def extract_upright(
+    extractor: FeatureExtractor,
+    image: NDArray[np.uint8],
+    camera: Camera,
+    upright_deg: float,
+    clockwise_deg: Sequence[float] = (),
+    ignored: Ignored | None = None,
+) -> View:
+    """Finds the features of a photograph, see `extract_turned`, in its upright raster, or in that turned by angles.
+
+    Turned clockwise by `upright_deg`, the raster is upright by the photograph's EXIF.
+    """
+    angles_deg = [(upright_deg + it) % 360 for it in clockwise_deg or (0.0,)]
+    if angles_deg == [0.0]:
+        return extractor.extract(image, camera, ignored)
+    return replace(extract_turned(extractor, image, camera, angles_deg, ignored), upright_deg=upright_deg)
 
 
 def extract_turned(
