@@ -20,6 +20,7 @@ from support.stores import (
     faults_of,
     make_reference,
     place_on,
+    read_image,
     view_of,
 )
 from typer.testing import CliRunner
@@ -69,7 +70,7 @@ def assert_same_contents(store: Store, skipped: int = 0) -> None:
         for number, loaded, indexed in zip(map(int, ids), snapshot.references, changes.added, strict=True):
             made = make_reference(f"r{number}", number, dimension=32 * (number % 2))
             assert_same_view(loaded.view, view_of(made))
-            assert store.read_image(key, f"r{number}") == made.image
+            assert read_image(store, key, f"r{number}") == made.image
             assert (indexed.descriptor is not None) == bool(number % 2)
             if indexed.descriptor is not None:
                 assert codec.encode_descriptor(indexed.descriptor) == codec.encode_descriptor(made.descriptors["vlad"])

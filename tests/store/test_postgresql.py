@@ -130,7 +130,6 @@ class TestGoingAway:
                     lambda: store.list_scenes(DEFAULT_TENANT, 10),
                     lambda: store.load_references(OFFICE, ["a"], EXTRACTOR),
                     lambda: store.list_changes(OFFICE, 1, NAME),
-                    lambda: store.read_image(OFFICE, "a"),
                     lambda: store.add_references(OFFICE, [make_reference("lost")]),
                     lambda: store.delete_reference(OFFICE, "a"),
                     lambda: store.create_scene(SceneKey("lost")),

@@ -74,7 +74,7 @@ class Shared:
         return Store.connect(self.url, cache_bytes)
 
     def open_as_is(self) -> PostgresqlDatabase:
-        return PostgresqlDatabase.open_as_is(self.url)
+        return PostgresqlDatabase.open(self.url, migrates=False)
 
     def fetch(self, statement: str, *parameters: object) -> list[tuple[Any, ...]]:
         with psycopg.connect(self.url) as connection:
@@ -220,3 +220,8 @@ def lose_page_with(file: Path, content: bytes) -> None:
     with file.open("r+b") as stream:
         stream.seek(at // PAGE_BYTES * PAGE_BYTES)
         stream.write(bytes(PAGE_BYTES))
+
+
+def read_image(store: Store, scene_key: SceneKey, reference_id: str) -> bytes:
+    """The image's bytes of a reference, by its id."""
+    return store.read_image_of(store.find_keys(scene_key, [reference_id])[reference_id])

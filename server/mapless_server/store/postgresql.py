@@ -70,21 +70,12 @@ class PostgresqlDatabase:
         self._engine = engine.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
 
     @staticmethod
-    def open(database_url: str) -> "PostgresqlDatabase":
-        """Connects, and migrates an empty or older database to this program's schema.
+    def open(database_url: str, migrates: bool = True) -> "PostgresqlDatabase":
+        """Connects, and migrates an empty or older database to this program's schema, unless it is taken as it is.
 
         The URL is "postgresql://user:password@host:5432/database"; libpq's options may follow after "?". StoreError if
-        it is invalid, the database cannot be reached, or it contains something else.
+        it is invalid, the database cannot be reached, or it contains something else; or is empty and not migrated.
         """
-        return PostgresqlDatabase._opened(database_url, migrates=True)
-
-    @staticmethod
-    def open_as_is(database_url: str) -> "PostgresqlDatabase":
-        """Connects to a store without migrating it; StoreError as in `open`, or if the database is empty."""
-        return PostgresqlDatabase._opened(database_url, migrates=False)
-
-    @staticmethod
-    def _opened(database_url: str, migrates: bool) -> "PostgresqlDatabase":
         url = parse_url(database_url)
         database = PostgresqlDatabase(_create_engine(url), f"{url.host or 'local'}:{url.port or 5432}/{url.database}")
         try:

@@ -21,8 +21,6 @@ from .records import IndexedReference, SceneChanges
 from .tables import (
     features,
     global_descriptor,
-    image,
-    mask,
     reference,
     removed_reference,
     scene,
@@ -191,21 +189,11 @@ def lock_reference(connection: Connection, key: str) -> Row[Any]:
     return _one(connection, statement.with_for_update(read=True, key_share=True), _reference_deleted)
 
 
-def find_image(connection: Connection, key: str) -> Row[Any]:
-    """Columns `reference_id`, `image_sha256` and `data` of a reference; raises NotFound if it was deleted."""
+def find_file(connection: Connection, key: str, table: Table) -> Row[Any]:
+    """Columns `reference_id`, `sha256` and `data` of a reference's image or mask; NotFound if it was deleted."""
     statement: Select[Any] = (
-        select(reference.c.reference_id, reference.c.image_sha256, image.c.data)
-        .outerjoin(image, image.c.reference_key == reference.c.key)
-        .where(_exists(key))
-    )
-    return _one(connection, statement, _reference_deleted)
-
-
-def find_mask(connection: Connection, key: str) -> Row[Any]:
-    """Columns `reference_id`, `mask_sha256` and `mask` of a reference; raises NotFound if it was deleted."""
-    statement: Select[Any] = (
-        select(reference.c.reference_id, reference.c.mask_sha256, mask.c.data.label("mask"))
-        .outerjoin(mask, mask.c.reference_key == reference.c.key)
+        select(reference.c.reference_id, reference.c[f"{table.name}_sha256"].label("sha256"), table.c.data)
+        .outerjoin(table, table.c.reference_key == reference.c.key)
         .where(_exists(key))
     )
     return _one(connection, statement, _reference_deleted)

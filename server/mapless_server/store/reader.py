@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial, wraps
 from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
 
-from sqlalchemy import Connection, Row, Select, select
+from sqlalchemy import Connection, Row, Select, Table, select
 
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.cache import LruCache
@@ -179,35 +179,25 @@ class StoreReader:
         return rows.reference_record(row)
 
     @observed
-    def read_image(self, scene_key: SceneKey, reference_id: str) -> bytes:
-        """Reads the image's bytes as they were added.
-
-        NotFound if there is no such scene or reference; DataLoss if the bytes are damaged.
-        """
-        with self.database.read() as connection:
-            return _read_image(connection, queries.find_key(connection, scene_key, reference_id))
-
-    @observed
     def read_image_of(self, key: str) -> bytes:
         """Reads the image's bytes as they were added, by the reference's key.
 
         NotFound if the reference was deleted; DataLoss if the bytes are damaged.
         """
-        with self.database.read() as connection:
-            return _read_image(connection, key)
+        return self._read_file(key, tables.image)
 
     @observed
     def read_mask_of(self, key: str) -> bytes:
-        """Reads the mask's bytes as they were added, by the reference's key; empty if it has none.
+        """Reads the mask's bytes, empty if the reference has none; errors as of `read_image_of`."""
+        return self._read_file(key, tables.mask)
 
-        NotFound if the reference was deleted; DataLoss if the bytes are damaged.
-        """
+    def _read_file(self, key: str, table: Table) -> bytes:
         with self.database.read() as connection:
-            row = unless_damaged(connection, lambda: queries.find_mask(connection, key), lambda: None)
+            row = unless_damaged(connection, lambda: queries.find_file(connection, key, table), lambda: None)
             if row is None:
                 reference_id = queries.find_by_key(connection, key, tables.reference.c.reference_id).reference_id
-                raise rows.data_loss(reference_id, "mask")
-            return rows.mask(row)
+                raise rows.data_loss(reference_id, table.name)
+            return rows.file(row, table.name)
 
     @observed
     def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:
@@ -327,14 +317,6 @@ class StoreReader:
         found = tuple(it for it in map(cached.get, resolved.keys) if it is not None)
         is_complete = len(found) == len(resolved.keys)
         return cached, SceneSnapshot(resolved.generation, found) if is_complete else None
-
-
-def _read_image(connection: Connection, key: str) -> bytes:
-    row = unless_damaged(connection, lambda: queries.find_image(connection, key), lambda: None)
-    if row is None:
-        reference_id = queries.find_by_key(connection, key, tables.reference.c.reference_id).reference_id
-        raise rows.data_loss(reference_id, "image")
-    return rows.image(row)
 
 
 def _read_features(connection: Connection, id_of: Mapping[str, str], extractor: str) -> dict[str, Row[Any]]:

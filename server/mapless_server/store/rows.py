@@ -211,19 +211,13 @@ def described_reference(row: Row[Any]) -> DescribedReference:
     return DescribedReference(record, view)
 
 
-def image(row: Row[Any]) -> bytes:
-    """Reads the image of a row of `queries.find_image`; raises DataLoss if it is damaged."""
+def file(row: Row[Any], what: str) -> bytes:
+    """Reads the file of a row of `queries.find_file`, empty for none; raises DataLoss if it is damaged or missing."""
     data: object = row.data
-    if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != row.image_sha256:
-        raise data_loss(row.reference_id, "image")
-    return data
-
-
-def mask(row: Row[Any]) -> bytes:
-    """Reads the mask of a row of `queries.find_mask`, empty for none; raises DataLoss if it is damaged or missing."""
-    data: object = b"" if row.mask is None else row.mask
-    if not isinstance(data, bytes) or (hashlib.sha256(data).hexdigest() if data else None) != row.mask_sha256:
-        raise data_loss(row.reference_id, "mask")
+    if data is None and row.sha256 is None:
+        return b""
+    if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != row.sha256:
+        raise data_loss(row.reference_id, what)
     return data
 
 

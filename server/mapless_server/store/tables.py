@@ -92,47 +92,38 @@ removed_reference = Table(
     Column("reference_key", _Key, primary_key=True),
 )
 
+
+def _reference_key(name: str = "reference_key") -> Column[str]:
+    """A reference's key, as a part of the primary key; its rows are deleted with the reference."""
+    return Column(name, _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True)
+
+
+def _bytes() -> Column[bytes]:
+    return Column("data", LargeBinary, nullable=False)
+
+
+def _encoded(table: str, kind: str, length: int) -> Table:
+    """A table of bytes, see codec.py, of which a reference has those of several kinds."""
+    kind_column = Column(kind, String(length), primary_key=True)
+    return Table(table, metadata, _reference_key(), kind_column, _bytes(), Column("sha256", _Sha256, nullable=False))
+
+
 # Images, masks and features have tables of their own, so that listing references does not read their bytes.
-image = Table(
-    "image",
-    metadata,
-    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
-    Column("data", LargeBinary, nullable=False),
-)
-
-mask = Table(
-    "mask",
-    metadata,
-    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
-    Column("data", LargeBinary, nullable=False),
-)
-
-features = Table(
-    "features",
-    metadata,
-    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
-    Column("extractor", String(128), primary_key=True),
-    Column("data", LargeBinary, nullable=False),  # processed camera and arrays, see codec.py
-    Column("sha256", _Sha256, nullable=False),
-)
-
-global_descriptor = Table(
-    "global_descriptor",
-    metadata,
-    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
-    Column("name", String(128), primary_key=True),
-    Column("data", LargeBinary, nullable=False),  # see codec.py
-    Column("sha256", _Sha256, nullable=False),
-)
+image = Table("image", metadata, _reference_key(), _bytes())
+mask = Table("mask", metadata, _reference_key(), _bytes())
+features = _encoded("features", "extractor", 128)
+global_descriptor = _encoded("global_descriptor", "name", 128)
+# Depth that is kept with references, see depths.py; which references are done is in reference_matching.
+reference_depth = _encoded("reference_depth", "kind", 255)
 
 # Matches of two references, see pairs.py; of the same features and options for each name in `matching`.
 reference_pair = Table(
     "reference_pair",
     metadata,
-    Column("first_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
-    Column("second_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+    _reference_key("first_key"),
+    _reference_key("second_key"),
     Column("matching", _Matching, primary_key=True),
-    Column("data", LargeBinary, nullable=False),  # see codec.py
+    _bytes(),  # see codec.py
     Column("sha256", _Sha256, nullable=False),
     Column("error_px", Double),  # see method/pairs/agreement.py; null if it is not known
     Index("reference_pair_by_second", "second_key"),
@@ -142,22 +133,12 @@ reference_pair = Table(
 reference_matching = Table(
     "reference_matching",
     metadata,
-    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
+    _reference_key(),
     Column("matching", _Matching, primary_key=True),
     # When a server may claim it: the end of a claim, or of the wait after a failure; null when its pairs are stored.
     Column("due_time_us", BigInteger),
     Column("failure_count", Integer, nullable=False, server_default=_NONE_YET),
     Index("reference_matching_by_due_time", "matching", "due_time_us"),
-)
-
-# Depth that is kept with references, see depths.py; which references are done is in reference_matching.
-reference_depth = Table(
-    "reference_depth",
-    metadata,
-    Column("reference_key", _Key, ForeignKey("reference.key", ondelete="CASCADE"), primary_key=True),
-    Column("kind", _Matching, primary_key=True),
-    Column("data", LargeBinary, nullable=False),  # see codec.py
-    Column("sha256", _Sha256, nullable=False),
 )
 
 # When a server last had use for a matching, to within an hour.

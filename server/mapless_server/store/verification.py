@@ -102,7 +102,7 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
         column.reference_id,
         column.geometry,
         column.geometry_sha256,
-        column.image_sha256,
+        column.image_sha256.label("sha256"),
         image.c.data,
         select(func.count()).where(features.c.reference_key == column.key).scalar_subquery().label("feature_sets"),
     ).outerjoin(image, image.c.reference_key == column.key)
@@ -111,7 +111,7 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
             yield f"{name}: image, or camera and pose, on damaged pages"
             continue
         yield from _fault(name, "camera and pose", codec.decode_geometry, row.key, row.geometry, row.geometry_sha256)
-        yield from _fault(name, "image", rows.image, row)
+        yield from _fault(name, "image", rows.file, row, "image")
         if not row.feature_sets:
             yield f"{name}: it has no features"
     yield from _orphans(connection, image)
@@ -120,7 +120,7 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
 def _check_masks(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
     column = reference.c
     statement: Select[Any] = (
-        select(column.key, column.scene_id, column.reference_id, column.mask_sha256, mask.c.data.label("mask"))
+        select(column.key, column.scene_id, column.reference_id, column.mask_sha256.label("sha256"), mask.c.data)
         .outerjoin(mask, mask.c.reference_key == column.key)
         .where(column.mask_sha256.is_not(None) | mask.c.data.is_not(None))
     )
@@ -128,7 +128,7 @@ def _check_masks(connection: Connection, counts: dict[str, int], on_progress: Pr
         if row is None:
             yield f"{name}: mask, on damaged pages"
             continue
-        yield from _fault(name, "mask", rows.mask, row)
+        yield from _fault(name, "mask", rows.file, row, "mask")
     yield from _orphans(connection, mask)
 
 
