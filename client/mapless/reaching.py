@@ -8,15 +8,7 @@ from typing import Any
 import grpc
 
 from .addresses import host_and_port
-from .errors import (
-    REFUSED,
-    USES_TLS,
-    DeadlineExceeded,
-    MaplessError,
-    Unavailable,
-    from_rpc_error,
-    is_unconnected,
-)
+from .errors import REFUSED, USES_TLS, DeadlineExceeded, MaplessError, Unavailable, from_rpc_error, is_unconnected
 from .options import ConnectOptions
 from .proxies import proxy_of
 

@@ -12,13 +12,7 @@ from ..answers import LocalizationResult, Rejected
 from ..axes import Axes
 from ..connection import Connection
 from ..geometry import Camera, RigidTransform
-from ..groups import (
-    GroupRejected,
-    RigImage,
-    RigLocalization,
-    SequenceFrame,
-    SequenceLocalization,
-)
+from ..groups import GroupRejected, RigImage, RigLocalization, SequenceFrame, SequenceLocalization
 from ..messages import answer_from_message, rig_from_message, sequence_from_message
 from ..names import reference_names, scene_name
 from ..priors import Priors, set_priors

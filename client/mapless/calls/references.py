@@ -17,13 +17,7 @@ from ..names import reference_name, reference_names, scene_name, shown
 from ..options import ConnectOptions
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, NewReference, create_request, read_image, read_mask
-from ..results import (
-    Coverage,
-    Reference,
-    ReferenceAudit,
-    RetrievedReference,
-    Scene,
-)
+from ..results import Coverage, Reference, ReferenceAudit, RetrievedReference, Scene
 from ..scenes import UNCHANGED, Calibration, UnchangedType, calibration_to_message, datum_to_message
 from ..v1 import reference_service_pb2 as pb
 from . import repeats

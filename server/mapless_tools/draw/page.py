@@ -11,27 +11,9 @@ from mapless.diagnostics import Debug, Diagnostics
 from mapless.lenses import lens_model_of
 from mapless_server.errors import InvalidArgument
 from mapless_tools.charts import figure_of, inline_svg, new_axes
-from mapless_tools.matches import (
-    MAX_GOOD,
-    MAX_WRONG,
-    Shot,
-    axes_on,
-    data_uri,
-    draw_matches,
-    rendered,
-    side_by_side,
-)
+from mapless_tools.matches import MAX_GOOD, MAX_WRONG, Shot, axes_on, data_uri, draw_matches, rendered, side_by_side
 from mapless_tools.output_files import render
-from mapless_tools.plan import (
-    FOUND,
-    OTHER,
-    REFERENCE,
-    Cameras,
-    basis_from_above,
-    down_of,
-    draw_ellipse,
-    draw_plan,
-)
+from mapless_tools.plan import FOUND, OTHER, REFERENCE, Cameras, basis_from_above, down_of, draw_ellipse, draw_plan
 
 Answer = LocalizationResult | Rejected
 MAX_PAIRS = 3

@@ -17,16 +17,7 @@ from typing import Any, TypeVar, cast
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photo_views import QueryViews
-from mapless_server.engine.query import (
-    COARSE,
-    POSE_PRIOR,
-    PREPARE,
-    REFINE,
-    Caller,
-    Query,
-    Result,
-    Tier,
-)
+from mapless_server.engine.query import COARSE, POSE_PRIOR, PREPARE, REFINE, Caller, Query, Result, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.search import Search, SearchJob, SearchStep
 from mapless_server.engine.stages import Method, QueryStages
@@ -45,13 +36,7 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.stored import DepthFinder
 from mapless_server.scheduling import Done, Flow, Job, Next
 from mapless_server.security import Principal, SceneKey, key_of
-from mapless_server.services.capture.calls import (
-    CapturedCall,
-    CapturedPart,
-    CaptureError,
-    Response,
-    diagnostics_of,
-)
+from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CaptureError, Response, diagnostics_of
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.watching import Watchers
 from mapless_server.store import DescribedReference, LruCache, ReferenceRecord, SceneAttributes, Store, codec
