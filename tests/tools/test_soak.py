@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.load.slopes import MIN_SAMPLES, Slope, slope
-from bench.load.soak import MIN_SETTLED_S, UNITS, SoakOptions, least_minutes, slopes_of
+from bench.load.soak import FIGURES, MIN_SETTLED_S, SoakOptions, least_minutes, slopes_of
 from bench.load.watch import Scrape, ServerState, ServerUnderLoad, read_state
 from mapless.geometry import Array
 
@@ -89,7 +89,7 @@ def state(at_s: float, **held: Any) -> ServerState:
 def test_slopes_skip_the_settling_and_need_enough_time() -> None:
     climbing = [state(at, resident_mib=min(500.0, at)) for at in np.arange(0.0, 3600.0, EVERY_S).tolist()]
     slopes = slopes_of(climbing, 1200)
-    assert set(slopes) == set(UNITS)
+    assert set(slopes) == set(FIGURES)
     assert slopes["resident_mib"].is_flat
     assert slopes_of(climbing, 3600 - MIN_SETTLED_S) == {}
 
@@ -102,7 +102,7 @@ def test_the_minimum_of_minutes_gives_slopes_and_less_none(options: SoakOptions)
         return slopes_of([state(at) for at in times], options.settle_share * 60 * minutes)
 
     least = least_minutes(options)
-    assert set(looked_at(least)) == set(UNITS)
+    assert set(looked_at(least)) == set(FIGURES)
     assert looked_at(least - 3) == {}
 
 

@@ -13,6 +13,7 @@ from mapless_tools.charts import COLOURS, prepared, use_logarithms
 from .pipeline import PipelineResult
 from .report import machine
 from .slopes import Slope
+from .soak import FIGURES
 from .step import Step
 from .watch import ServerState, column
 
@@ -28,17 +29,6 @@ RATES: Mapping[str, tuple[str, Value]] = {
     "answered in time": (_GREEN, lambda step: step.account.goodput_per_s),
     "refused": (_BLUE, lambda step: step.account.refused_per_s),
     "overdue": (_RED, lambda step: step.account.overdue_per_s),
-}
-PANELS: Mapping[str, str] = {
-    "resident_mib": "memory, MiB",
-    "unique_mib": "memory of its own, MiB",
-    "python_blocks": "Python's blocks",
-    "threads": "threads",
-    "descriptors": "open files and sockets",
-    "sockets": "sockets",
-    "data_mib": "data folder, MiB",
-    "waiting_jobs": "jobs that wait",
-    "loop_lag_ms": "event loop late, ms",
 }
 
 
@@ -84,10 +74,10 @@ def draw_soak(states: Sequence[ServerState], slopes: Mapping[str, Slope]) -> Fig
     """Draws a panel for each figure of the server's state, with its slope if there is one."""
     figure = Figure(figsize=(12.5, 16), layout="constrained")
     minutes = [(state.at_s - states[0].at_s) / 60 for state in states]
-    for axes, (field, label) in zip(figure.subplots(5, 2).flat, PANELS.items(), strict=False):
+    for axes, (field, (name, unit)) in zip(figure.subplots(5, 2).flat, FIGURES.items(), strict=False):
         found = slopes.get(field)
         verdict = "" if found is None else f": {found.per_hour:+.3g} an hour, {found.verdict}"
-        prepared(axes, label + verdict, "minutes", "").plot(minutes, column(states, field))
+        prepared(axes, f"{name}{unit and f', {unit}'}{verdict}", "minutes", "").plot(minutes, column(states, field))
         if found is not None:  # through the median of the settled samples, in the middle of their time
             half = found.per_hour * found.hours / 2
             ends = (minutes[-1] - 60 * found.hours, minutes[-1])

@@ -18,7 +18,6 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from mapless import ConnectOptions, MaplessError, aio
 from mapless.names import scene_name
-from mapless.proxies import is_exempt
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
 from mapless.v1 import reference_service_pb2 as reference_pb
@@ -26,7 +25,7 @@ from mapless.v1 import reference_service_pb2_grpc as reference_rpcs
 from mapless_tools.demo import Photograph, Place
 
 from .driving import SCENE
-from .sender import MAX_MESSAGE_BYTES
+from .sender import own_channel
 
 ONCE = ConnectOptions(max_attempts=1, timeout_s=20.0)
 """The outcome of each call is counted, not that of a retry."""
@@ -128,7 +127,7 @@ class Workers:
 
     async def watchers(self, chance: random.Random) -> None:
         """Watches the scene's queries and the server's health for a while each, and cancels."""
-        async with _channel(self.address) as channel:
+        async with own_channel(self.address) as channel:
             for _ in self._rounds():
                 watched = rpcs.LocalizationServiceStub(channel).WatchQueries(
                     pb.WatchQueriesRequest(scene=scene_name(SCENE))
@@ -165,7 +164,7 @@ class Workers:
     async def wrong(self, chance: random.Random) -> None:
         """Requests scenes that do not exist, creates one that exists, and sends bytes that are not a message."""
         photo = self.place.queries[0]
-        async with aio.Client(self.address, ONCE) as client, _channel(self.address) as channel:
+        async with aio.Client(self.address, ONCE) as client, own_channel(self.address) as channel:
             raw: Any = channel.unary_unary("/mapless.v1.ReferenceService/GetScene")
             page = reference_pb.ListReferencesRequest(scene=scene_name(SCENE), page_token="of another list")
             wrongs: Sequence[tuple[Callable[[], Awaitable[object]], str]] = (
@@ -208,15 +207,6 @@ async def churning(workers: Workers, seed: int) -> AsyncIterator[Outcomes]:
     for error in ended:
         if isinstance(error, BaseException):
             raise RuntimeError("a worker beside the queries failed, or does not end") from error
-
-
-def _channel(address: str) -> grpc.aio.Channel:
-    options = [
-        ("grpc.use_local_subchannel_pool", 1),
-        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-        ("grpc.enable_http_proxy", int(not is_exempt(address))),
-    ]
-    return grpc.aio.insecure_channel(address, options)
 
 
 async def _listed(client: aio.Client) -> int:

@@ -50,10 +50,19 @@ def mixed_requests(named: Requests, queries: Sequence[Photograph]) -> Requests:
     chosen = [photo_request(query.data, query.camera, ()) for query in queries]
     camera = queries[0].camera
     blank = np.full((camera.height_px, camera.width_px, 3), 127, np.uint8)
-    elsewhere = np.random.default_rng(0).integers(0, 256, (camera.height_px // 8, camera.width_px // 8, 3))
-    noise = cv2.resize(elsewhere.astype(np.uint8), (camera.width_px, camera.height_px), interpolation=cv2.INTER_CUBIC)
-    rejected = [photo_request(bytes(cv2.imencode(".jpg", it)[1]), camera, ()) for it in (blank, noise)]
+    (noise,) = noise_photographs(camera, 1)
+    rejected = [photo_request(it, camera, ()) for it in (bytes(cv2.imencode(".jpg", blank)[1]), noise)]
     return Requests([*named.good, *chosen, *rejected], named.bad)
+
+
+def noise_photographs(camera: Camera, count: int) -> list[bytes]:
+    """JPEG files of noise of a camera's size: features everywhere, no match."""
+    random, made = np.random.default_rng(0), []
+    for _ in range(count):
+        coarse = random.integers(0, 256, (camera.height_px // 8, camera.width_px // 8, 3)).astype(np.uint8)
+        noise = cv2.resize(coarse, (camera.width_px, camera.height_px), interpolation=cv2.INTER_CUBIC)
+        made.append(bytes(cv2.imencode(".jpg", noise)[1]))
+    return made
 
 
 def photo_request(image: bytes, camera: Camera, references: Sequence[str]) -> bytes:

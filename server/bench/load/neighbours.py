@@ -12,18 +12,24 @@ from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from mapless_server.bounds import check_bounds
 from mapless_server.security import create_token
 from mapless_server.settings import PREFIX
 from mapless_tools.child import CONNECT
-from mapless_tools.demo import Photograph, Place
+from mapless_tools.demo import Place
 from mapless_tools.progress import Progress
 
 from .calls import CallRecord, Fate, account_of
-from .driving import METHOD, LoadedServer, find_saturation, open_step, photo_request, read_answer, server_with_scene
+from .driving import (
+    METHOD,
+    LoadedServer,
+    find_saturation,
+    noise_photographs,
+    open_step,
+    photo_request,
+    read_answer,
+    server_with_scene,
+)
 from .report import Check
 from .sender import Metadata, connected, send_closed_loop
 from .step import Step
@@ -98,9 +104,10 @@ def measure_neighbours(
         surveyor = create_token(file, "surveyor", "default", "write", None)
         environment = {f"{PREFIX}TOKENS_FILE": str(file)}
         with server_with_scene(place, progress, environment, log, replace(CONNECT, token=surveyor)) as server:
-            foreign = [
-                photo_request(it.data, it.camera, ()) for it in (elsewhere.queries if elsewhere else _of_nothing(place))
-            ]
+            camera = place.queries[0].camera
+            foreign = [photo_request(it, camera, ()) for it in noise_photographs(camera, 4)]
+            if elsewhere:
+                foreign = [photo_request(it.data, it.camera, ()) for it in elsewhere.queries]
             if options.own_tokens:
                 own = [photo_request(it.data, it.camera, ()) for it in place.queries]
                 server = replace(server, requests=replace(server.requests, good=own))
@@ -180,14 +187,3 @@ async def _measure(
         )
     outcomes = dict(account_of(records, options.step_s + _WARM_UP_S).outcomes)
     return NeighbourResult(options, ramp, saturation_per_s, alone, beside, outcomes)
-
-
-def _of_nothing(place: Place) -> list[Photograph]:
-    """Photographs of noise, by the size and camera of a place's first query: features everywhere, no match."""
-    query, random = place.queries[0], np.random.default_rng(0)
-    camera, made = query.camera, []
-    for _ in range(4):
-        coarse = random.integers(0, 256, (camera.height_px // 8, camera.width_px // 8, 3)).astype(np.uint8)
-        noise = cv2.resize(coarse, (camera.width_px, camera.height_px), interpolation=cv2.INTER_CUBIC)
-        made.append(replace(query, data=bytes(cv2.imencode(".jpg", noise)[1])))
-    return made

@@ -48,16 +48,7 @@ async def connected(
 
     `metadata` makes the metadata of each call of a client, by its index.
     """
-    options = [
-        # Channels to one address share a connection otherwise, and the server would see one client.
-        ("grpc.use_local_subchannel_pool", 1),
-        ("grpc.enable_http_proxy", int(not is_exempt(address))),
-        ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
-        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
-        # A refusal is measured, not the outcome of a retry.
-        ("grpc.enable_retries", 0),
-    ]
-    channels = [grpc.aio.insecure_channel(address, options) for _ in range(clients)]
+    channels = [own_channel(address) for _ in range(clients)]
     try:
         for channel in channels:
             await asyncio.wait_for(channel.channel_ready(), 30)
@@ -66,6 +57,19 @@ async def connected(
     finally:
         for channel in channels:
             await channel.close()
+
+
+def own_channel(address: str) -> grpc.aio.Channel:
+    """A channel with a connection of its own, without retries: a refusal is measured, not the outcome of a retry."""
+    options = [
+        # Channels to one address share a connection otherwise, and the server would see one client.
+        ("grpc.use_local_subchannel_pool", 1),
+        ("grpc.enable_http_proxy", int(not is_exempt(address))),
+        ("grpc.max_send_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.max_receive_message_length", MAX_MESSAGE_BYTES),
+        ("grpc.enable_retries", 0),
+    ]
+    return grpc.aio.insecure_channel(address, options)
 
 
 def _with_metadata(method: Any, metadata: Callable[[], Metadata]) -> Callable[..., Any]:

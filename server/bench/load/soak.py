@@ -25,18 +25,18 @@ from .slopes import CONFIDENCE, MIN_SAMPLES, Slope, slope
 from .step import Step, closed_loop_step
 from .watch import FIELDS, Reconciliation, ServerState, column, reconcile, server_states
 
-UNITS: Mapping[str, str] = {
-    "resident_mib": "MiB",
-    "unique_mib": "MiB",
-    "python_blocks": "blocks",
-    "threads": "",
-    "descriptors": "",
-    "sockets": "",
-    "data_mib": "MiB",
-    "waiting_jobs": "",
-    "loop_lag_ms": "ms",
+FIGURES: Mapping[str, tuple[str, str]] = {
+    "resident_mib": ("memory", "MiB"),
+    "unique_mib": ("memory of its own", "MiB"),
+    "python_blocks": ("Python's blocks", ""),
+    "threads": ("threads", ""),
+    "descriptors": ("open files and sockets", ""),
+    "sockets": ("sockets", ""),
+    "data_mib": ("data folder", "MiB"),
+    "waiting_jobs": ("jobs that wait", ""),
+    "loop_lag_ms": ("event loop late", "ms"),
 }
-"""Units of the figures whose slopes are taken, by name."""
+"""The figures whose slopes are taken, by their field: description and unit."""
 BOUND = ("resident_mib", "unique_mib", "python_blocks", "threads", "descriptors", "sockets")
 """Figures that must not grow. The others are reported: the data folder grows by what is kept of deleted scenes."""
 MIN_SETTLED_S = 300.0
@@ -111,7 +111,7 @@ def slopes_of(found: Sequence[ServerState], settle_s: float) -> dict[str, Slope]
     settled = [state for state in found if state.at_s >= found[0].at_s + settle_s]
     if len(settled) < MIN_SAMPLES or settled[-1].at_s - settled[0].at_s < MIN_SETTLED_S:
         return {}
-    return {field: slope(column(settled, "at_s"), column(settled, field)) for field in UNITS}
+    return {field: slope(column(settled, "at_s"), column(settled, field)) for field in FIGURES}
 
 
 def least_minutes(options: SoakOptions) -> int:
@@ -127,7 +127,7 @@ def soak_checks(result: SoakResult) -> list[Check]:
     overdue, failed = step.account.count(Fate.OVERDUE), step.account.count(Fate.FAILED)
     failures = "; ".join(f"{what} ({text})" for what, text in result.outcomes.failures.items())
     return [
-        *(_slope_check(field, result.slopes.get(field), field in BOUND, result.options) for field in UNITS),
+        *(_slope_check(field, result.slopes.get(field), field in BOUND, result.options) for field in FIGURES),
         _account_check(result),
         Check("accepted calls that ended after their deadline", str(overdue), "0", overdue == 0),
         Check("calls that failed", str(failed), "0", failed == 0),
@@ -146,17 +146,12 @@ def soak_lines(result: SoakResult) -> list[str]:
 
 
 def soak_json(result: SoakResult) -> dict[str, Any]:
-    """The figures as JSON values."""
-    return {
-        "scene": result.scene,
-        "options": vars(result.options),
-        "rate_per_s": result.rate_per_s,
-        "before": [step.as_json() for step in result.before],
-        "soak": result.soak.as_json(),
+    """The figures for programs."""
+    shown = {name: it for name, it in vars(result).items() if name != "outcomes"}
+    return shown | {
         "slopes": {field: {**vars(it), "verdict": it.verdict} for field, it in result.slopes.items()},
         "states": {field: column(result.states, field) for field in ("at_s", *FIELDS)},
         "beside": {f"{worker} {code}": count for (worker, code), count in sorted(result.outcomes.counts.items())},
-        "account": None if result.account is None else vars(result.account),
     }
 
 
@@ -210,7 +205,7 @@ def _slope_check(field: str, found: Slope | None, is_bound: bool, options: SoakO
     figure, bar = f"slope of {field}", f"0 within {100 * CONFIDENCE:.0f} %" if is_bound else "reported"
     if found is None:
         return Check(figure, f"{options.minutes:g} minutes are too short, {least_minutes(options)} are not", bar, None)
-    unit = f" {UNITS[field]}".rstrip()
+    unit = f" {FIGURES[field][1]}".rstrip()
     value = (
         f"{found.per_hour:+.3g} ({found.low:+.3g} to {found.high:+.3g}){unit}/h around {found.level:.6g}: "
         f"{found.verdict}"
