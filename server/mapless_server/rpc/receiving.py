@@ -8,7 +8,7 @@ methods are served as if their callers sent streams, of which the first message 
 import asyncio
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -27,11 +27,30 @@ Context = Any
 """A grpc.aio.ServicerContext; its annotations are wrong in places."""
 
 
+class Tasks:
+    """Tasks of calls that are never cancelled, since grpc reads or writes their buffers; they end with their calls."""
+
+    def __init__(self) -> None:
+        self._running: set[asyncio.Future[Any]] = set()  # the loop holds only weak references
+
+    def begin(self, work: Awaitable[Any]) -> asyncio.Future[Any]:
+        """Starts a task, whose exception need not be retrieved."""
+        task = asyncio.ensure_future(work)
+        self._running.add(task)
+        task.add_done_callback(self._end)
+        return task
+
+    def _end(self, task: asyncio.Future[Any]) -> None:
+        self._running.discard(task)
+        if not task.cancelled():
+            task.exception()  # which asyncio would otherwise log
+
+
 class Receiver:
     """Reads messages; runs on the event loop."""
 
     def __init__(self) -> None:
-        self._reading: set[asyncio.Future[Any]] = set()  # the loop holds only weak references
+        self._reading = Tasks()
 
     async def message(self, context: Context, limit_s: float, evicted: asyncio.Future[None] | None = None) -> bytes:
         """Receives the bytes of a call's first message.
@@ -46,11 +65,8 @@ class Receiver:
             Overloaded: the call was evicted.
             InvalidArgument: the caller sent no message, or a too large one (which grpc itself reports to the caller).
         """
-        reading = asyncio.ensure_future(context.read())
-        self._reading.add(reading)
-        reading.add_done_callback(self._forget)
+        reading = self._reading.begin(context.read())
         awaited: set[asyncio.Future[Any]] = {reading} if evicted is None else {reading, evicted}
-        # Never cancelled, because grpc still writes into its buffer. It ends with the call at the latest.
         await asyncio.wait(awaited, timeout=max(0.0, limit_s), return_when=asyncio.FIRST_COMPLETED)
         if not reading.done():
             if evicted is not None and evicted.done():
@@ -60,10 +76,6 @@ class Receiver:
         if message is grpc.aio.EOF:
             raise InvalidArgument("the call has no message, or one that is too large", reason="MALFORMED_MESSAGE")
         return bytes(message)
-
-    def _forget(self, reading: asyncio.Future[Any]) -> None:
-        self._reading.discard(reading)
-        retrieve(reading)
 
 
 MAX_CALLS_OF_CALLER = 512
@@ -175,17 +187,16 @@ class _Latest:
     def __init__(self, context: Context) -> None:
         self._context = context
         self._message: Any = None
-        self._writing: asyncio.Future[None] | None = None
+        self._writing: asyncio.Future[Any] | None = None
+        self._tasks = Tasks()
 
     async def write(self, message: Any) -> None:
         """Returns at once."""
         self._message = message
         if self._writing is None or self._writing.done():
-            self._writing = asyncio.ensure_future(self._write())
-            self._writing.add_done_callback(retrieve)
+            self._writing = self._tasks.begin(self._write())
 
     async def _write(self) -> None:
-        """Sends the messages; never cancelled, for the same reason as reading."""
         while self._message is not None:
             message, self._message = self._message, None
             await self._context.write(message)
@@ -209,9 +220,3 @@ def quiet_ended_calls() -> None:
 
 def _is_no_ended_call(record: logging.LogRecord) -> bool:
     return not has_ended(record.exc_info[1] if record.exc_info else None)
-
-
-def retrieve(task: asyncio.Future[Any]) -> None:
-    """Retrieves the exception of a task of a call that has ended, which asyncio would otherwise log."""
-    if not task.cancelled():
-        task.exception()

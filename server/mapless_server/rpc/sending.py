@@ -20,7 +20,7 @@ from grpc_status import rpc_status
 
 from mapless_server.errors import AlreadyExists, DeadlineExceeded, NotFound, Overloaded, RequestError
 
-from .receiving import Context, has_ended, retrieve
+from .receiving import Context, Tasks, has_ended
 
 REQUEST_ID_KEY = "x-request-id"
 
@@ -38,7 +38,7 @@ class Sender:
     """Sends messages and statuses; runs on the event loop."""
 
     def __init__(self) -> None:
-        self._sending: set[asyncio.Task[None]] = set()  # the loop holds only weak references
+        self._sending = Tasks()
 
     async def headers(self, context: Context) -> None:
         """Sends the headers of a stream; raises the same exceptions as `message`.
@@ -72,7 +72,7 @@ class Sender:
                 if has_ended(failure):
                     raise asyncio.CancelledError("the call has ended") from None
                 raise
-        aborting = self._begin(abort)
+        aborting = self._sending.begin(abort)
         await asyncio.wait({aborting}, timeout=_STATUS_LIMIT_S)
         if not aborting.done():
             raise asyncio.CancelledError("the caller does not read")
@@ -81,24 +81,13 @@ class Sender:
         aborting.result()
 
     async def _in_time(self, sending: Coroutine[Any, Any, None], limit_s: float) -> None:
-        task = self._begin(sending)
+        task = self._sending.begin(sending)
         await asyncio.wait({task}, timeout=limit_s)
         if not task.done():
             raise DeadlineExceeded("the caller did not read a message in time", reason="READ_LATE")
         if isinstance(task.exception(), grpc.aio.BaseError):
             raise asyncio.CancelledError("the caller does not read")
         task.result()
-
-    def _begin(self, sending: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Sends in a task that is never cancelled, because grpc still reads its buffer; it ends with the call."""
-        task = asyncio.ensure_future(sending)
-        self._sending.add(task)
-        task.add_done_callback(self._forget)
-        return task
-
-    def _forget(self, task: asyncio.Task[None]) -> None:
-        self._sending.discard(task)
-        retrieve(task)
 
 
 UNREAD_BYTES = 256 * 2**20
