@@ -92,18 +92,10 @@ def restore_command(
 
 
 def _open(config: Path | None, data_dir: Path | None, as_is: bool = False) -> Database:
-    """The settings' store: migrated to this program's schema, and created if missing; or read while others use it."""
     from mapless_server.settings import load_settings
-    from mapless_server.store.postgresql import PostgresqlDatabase
-    from mapless_server.store.sqlite import SqliteDatabase
-    from mapless_tools.stores import open_database_as_is
+    from mapless_tools.stores import open_database
 
-    settings = load_settings({"data_dir": data_dir}, config).settings
-    if as_is:
-        return open_database_as_is(settings)
-    if settings.database_url:
-        return PostgresqlDatabase.open(settings.database_url.get_secret_value())
-    return SqliteDatabase.open(settings.data_dir)
+    return open_database(load_settings({"data_dir": data_dir}, config).settings, as_is)
 
 
 @contextmanager

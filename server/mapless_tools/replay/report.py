@@ -19,7 +19,7 @@ from mapless_server.store.backup import reading_backup
 from mapless_server.store.database import Database
 from mapless_server.store.migrations import read_version
 from mapless_server.store.tables import SCHEMA_VERSION
-from mapless_tools.stores import open_database_as_is
+from mapless_tools.stores import open_database
 
 from .comparing import Change, changed, compare, outcome_of, stage_seconds
 from .recompute import StoredReferences, recompute, response_of
@@ -144,7 +144,7 @@ def _read(path: Path, folder: Path, unreadable: list[str]) -> CapturedCall | Non
 @contextmanager
 def _store(settings: Settings, backup: Path | None) -> Iterator[Store]:
     try:
-        with reading_backup(backup) if backup else closing(open_database_as_is(settings)) as database:
+        with reading_backup(backup) if backup else closing(open_database(settings, as_is=True)) as database:
             _check_schema(database)
             yield Store(database, LruCache(settings.reference_cache_mib * 2**20), name_cache_bytes=0)
     except StoreError as error:
