@@ -76,17 +76,7 @@ class WorkQueue:
         quota: Quota | None = None,
         low: Mapping[str, int] | None = None,
     ) -> None:
-        """Makes an idle queue.
-
-        Args:
-            stages: the stages, in the order in which jobs go through them.
-            lanes: number of threads of each lane.
-            options: options of the queue.
-            observer: receives the events.
-            failure_of: function that classifies exceptions of stages.
-            quota: quota of the tenants; None if they are not limited.
-            low: number of threads of low priority that lanes have besides, for what waits aside; None for none.
-        """
+        """Makes an idle queue; arguments as of `Scheduler`, and `failure_of`, which classifies exceptions of stages."""
         self._options = options
         self._observer = observer
         self._failure_of = failure_of

@@ -8,11 +8,8 @@ turned about its axis gives the same vector.
 It takes about 1 ms for 2048 features, and nothing is downloaded.
 
 A vocabulary is the distribution of local descriptors, learned once and shipped, or assumed without data. The shipped
-ones were learned from rendered photographs (server/research, measured once). Measured with SIFT in the kitchen of
-7-Scenes (100 references, 120 queries), by the share of the first ten that are within 0.5 m and 30 degrees of the
-query: 0.95 with the rendered vocabulary, 0.94 with one learned from other real places, 0.82 with one that needs no
-data. All three have such a reference among the first ten for every query. With EdgePoint2 (76 references, 76 queries
-of the same): 0.99 with the rendered vocabulary, 0.95 without data, where SIFT has 0.91.
+ones were learned from rendered photographs (server/research, measured once); what others give is in
+docs/decisions/026-retrieval.md.
 """
 
 import hashlib
