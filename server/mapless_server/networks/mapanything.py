@@ -23,7 +23,7 @@ from .blocks import BLOCK_EPS, Block, LayerNorm
 from .checkpoint import FileNames
 from .encoder import PATCH_PX, PlainEncoder
 from .heads import DenseFeatures, DenseRegression, ResidualMlp
-from .network import IMAGE_MEAN, IMAGE_STD, Network, NetworkOutput
+from .network import Network, NetworkOutput
 from .view_conditions import (
     MIN_LENGTH,
     MapEncoder,
@@ -129,17 +129,12 @@ class MapAnything(Network):
     metre_sigma = 0.2
     """A third party found a mean error of the scale of 16 % on ETH3D, for a normal distribution 0.8 of this."""
     file_names = FileNames(canonical_name, UNUSED, _describe_misfit)
-    image_mean: Tensor
-    image_std: Tensor
 
     def __init__(self, sizes: MapAnythingSizes | None = None) -> None:
         sizes = sizes or MapAnythingSizes()
         super().__init__()
         self.sizes = sizes
         width = sizes.width
-        # No checkpoint holds the two constants, so they have values even in a network on the meta device.
-        for name, values in (("image_mean", IMAGE_MEAN), ("image_std", IMAGE_STD)):
-            self.register_buffer(name, torch.tensor(values, device="cpu").view(1, 3, 1, 1), persistent=False)
         self.scale_token = nn.Parameter(torch.empty(width))
         encoder = PlainEncoder(width, sizes.encoder_heads, sizes.encoder_depth, gated=True)
         self.encoder = nn.ModuleDict({"model": encoder})
@@ -183,7 +178,7 @@ class MapAnything(Network):
 
         Images are (V, 3, H, W) in [0, 1], rays (V, H, W, 3) unit directions in the camera's frame, of any kind of lens.
         """
-        encoded = self.encoder["model"]((images - self.image_mean) / self.image_std)
+        encoded = self.encoder["model"](self.normalized(images))
         of_class, patches = encoded.split([1, encoded.shape[1] - 1], dim=1)
         if rays is not None:
             patches = patches + self.ray_dirs_encoder(rays.permute(0, 3, 1, 2))

@@ -17,9 +17,9 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from .blocks import BLOCK_EPS, LayerNorm, Linear
-from .encoder import PatchEmbedding, PlainEncoder
-from .network import IMAGE_MEAN, IMAGE_STD, patch_grid
+from .blocks import BLOCK_EPS, LayerNorm
+from .encoder import PlainEncoder
+from .network import ImageNetwork, patch_grid
 
 ROUNDS = 3
 """Rounds of the Sinkhorn iteration; the published weights were trained with them, so not to be tuned."""
@@ -146,18 +146,12 @@ class Mixing(nn.Module):
         return mixed
 
 
-class MegaLoc(nn.Module):
+class MegaLoc(ImageNetwork):
     """Images to descriptors."""
-
-    image_mean: Tensor
-    image_std: Tensor
 
     def __init__(self, sizes: MegaLocSizes | None = None) -> None:
         sizes = sizes or MegaLocSizes()
         super().__init__()
-        # No checkpoint holds the two constants, so they have values even in a network on the meta device.
-        for name, values in (("image_mean", IMAGE_MEAN), ("image_std", IMAGE_STD)):
-            self.register_buffer(name, torch.tensor(values, device="cpu").view(1, 3, 1, 1), persistent=False)
         self.backbone = Backbone(sizes.width, sizes.heads, sizes.depth)
         self.aggregator = Mixing(sizes)
 
@@ -171,19 +165,9 @@ class MegaLoc(nn.Module):
 
         ValueError if a side is not a multiple of 14, or there are no more patches than SALAD has clusters.
         """
-        tokens = self.backbone((images - self.image_mean) / self.image_std)
+        tokens = self.backbone(self.normalized(images))
         descriptors: Tensor = F.normalize(self.aggregator(tokens), dim=1)
         return descriptors
-
-    def set_compute_type(self, dtype: torch.dtype) -> None:
-        """Casts the parts that compute in low precision: the transformer's linear layers and the patch embedding.
-
-        The residual stream and all of SALAD stay float32: SALAD is a hundredth of the time, and its logarithms and sums
-        over patches are sensitive to rounding.
-        """
-        for module in self.backbone.modules():
-            if isinstance(module, (Linear, PatchEmbedding)):
-                module.to(dtype)
 
     @torch.no_grad()
     def reduce(self, length: int) -> None:

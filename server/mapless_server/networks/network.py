@@ -30,7 +30,35 @@ class NetworkOutput:
     camera_poses: Tensor
 
 
-class Network(nn.Module, ABC):
+class ImageNetwork(nn.Module):
+    """A network of images in [0, 1], whose transformer blocks can compute in low precision."""
+
+    image_mean: Tensor
+    image_std: Tensor
+
+    def __init__(self, are_constants_stored: bool = False) -> None:
+        super().__init__()
+        # Checkpoints may lack the two constants, so they have values even in a network on the meta device.
+        for name, values in (("image_mean", IMAGE_MEAN), ("image_std", IMAGE_STD)):
+            constant = torch.tensor(values, device="cpu").view(1, 3, 1, 1)
+            self.register_buffer(name, constant, persistent=are_constants_stored)
+
+    def normalized(self, images: Tensor) -> Tensor:
+        """Images (..., 3, H, W) in the encoders' units."""
+        return (images - self.image_mean) / self.image_std
+
+    def set_compute_type(self, dtype: torch.dtype) -> None:
+        """Casts the parts that compute in low precision: linear layers of all transformer blocks, patch embeddings.
+
+        The rest, normalizations, LayerScale, learned tokens, encoders of conditions and the heads themselves, stays
+        float32; so does SALAD, a hundredth of the time, whose logarithms and sums are sensitive to rounding.
+        """
+        for module in self.modules():
+            if isinstance(module, (Linear, PatchEmbedding)):
+                module.to(dtype)
+
+
+class Network(ImageNetwork, ABC):
     """A network in two steps, so that the result of the first can be cached for each view.
 
     `encode` depends on one view alone, `reconstruct` on all views of a scene.
@@ -43,16 +71,6 @@ class Network(nn.Module, ABC):
 
     conditioned: bool
     metre_sigma: float | None = None
-
-    def set_compute_type(self, dtype: torch.dtype) -> None:
-        """Casts the parts that compute in low precision: linear layers of all transformer blocks, patch embeddings.
-
-        The rest, normalizations, LayerScale, learned tokens, encoders of conditions and the heads themselves, stays
-        float32.
-        """
-        for module in self.modules():
-            if isinstance(module, (Linear, PatchEmbedding)):
-                module.to(dtype)
 
     @property
     @abstractmethod

@@ -17,7 +17,7 @@ from .conditions import PoseInjection, normalize_poses, prope, rays_from_intrins
 from .decoder import SPECIALS, AlternatingDecoder, Injection, TokenLayout, make_layout
 from .encoder import PATCH_PX, Encoder, PatchEmbedding
 from .heads import CameraHead, ConvHead, HeadDecoder, LinearHead, MetricDecoder
-from .network import IMAGE_MEAN, IMAGE_STD, Network, NetworkOutput
+from .network import Network, NetworkOutput
 
 UNUSED = (
     *("omega", "flow_decoder.", "flow_head.", "global_points_decoder.", "global_point_head."),
@@ -61,16 +61,11 @@ class PiNetwork(Network):
     max_log_depth = math.inf
     """Largest logarithm of a depth."""
     file_names = FileNames(unused_prefixes=UNUSED)
-    image_mean: Tensor
-    image_std: Tensor
 
     def __init__(self, sizes: Sizes) -> None:
-        super().__init__()
+        super().__init__(are_constants_stored=True)
         self.sizes = sizes
         self.register_token = nn.Parameter(torch.empty(1, 1, SPECIALS, sizes.width))
-        # Checkpoints may lack the two constants, so they have values even in a network on the meta device.
-        self.register_buffer("image_mean", torch.tensor(IMAGE_MEAN, device="cpu").view(1, 3, 1, 1))
-        self.register_buffer("image_std", torch.tensor(IMAGE_STD, device="cpu").view(1, 3, 1, 1))
         self.encoder = Encoder(sizes.width, sizes.heads, sizes.encoder_depth)
         self.decoder = AlternatingDecoder(sizes.width, sizes.heads, sizes.decoder_depth)
         self.point_decoder = self._head_decoder(sizes.width)
@@ -106,7 +101,7 @@ class PiNetwork(Network):
 
     def encode_images(self, images: Tensor) -> Tensor:
         """The encoder's patch tokens (V, P, C) of images (V, 3, H, W) in [0, 1]."""
-        return self.encoder((images - self.image_mean) / self.image_std)
+        return self.encoder(self.normalized(images))
 
     def begin(self, patches: Tensor, layout: TokenLayout) -> Tensor:
         """Patch tokens (V, P, C) to tokens (V, T, C), special ones first, after block 0 of the decoder."""

@@ -126,10 +126,8 @@ def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateL
         network = make_depth_network(settings, tiers)
         options = engine_options(settings)
         return engine_over(store, tiers, options, metrics, quota, None, descriptor, metrics, network)
-    except (ImportError, WeightsMissing) as error:
+    except UNUSABLE as error:
         raise StartupError(what_is_missing(error)) from error
-    except (ValueError, WeightsError) as error:
-        raise StartupError(str(error)) from error
 
 
 def engine_over(
@@ -305,8 +303,12 @@ def make_first_features(settings: Settings) -> tuple[str, FeatureExtractor]:
     return next(iter(extractors.items()))
 
 
-def what_is_missing(error: ImportError | WeightsMissing) -> str:
-    """Says which package or weights are missing, and how to get them, for the operator."""
+UNUSABLE = (ImportError, ValueError, WeightsError)
+"""The errors of settings that name what is not there, or cannot be used."""
+
+
+def what_is_missing(error: Exception) -> str:
+    """The error for the operator; of a package that is missing, how to get it."""
     return install_hint(error) if isinstance(error, ImportError) else str(error)
 
 

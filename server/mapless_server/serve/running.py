@@ -279,10 +279,8 @@ def _make_tracer(settings: Settings) -> "OtlpTracer | None":
         from mapless_server.observability.otlp import make_otlp_tracer
 
         return make_otlp_tracer(settings.otlp_endpoint)
-    except ImportError as error:
+    except (ImportError, ValueError) as error:
         raise StartupError(what_is_missing(error)) from error
-    except ValueError as error:
-        raise StartupError(str(error)) from error
 
 
 def _serve_metrics(

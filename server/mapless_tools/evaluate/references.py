@@ -12,9 +12,8 @@ from mapless_server.images import ImageLimits, image_size
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.matching import OPTIONS, CorrespondOptions, mutual_matches
 from mapless_server.method.features.views import PosedView, View
-from mapless_server.networks.weights import WeightsError
 from mapless_server.scenes.retrieval.ranking import spread_choice
-from mapless_server.serve.assembly import image_limits, make_first_features
+from mapless_server.serve.assembly import UNUSABLE, image_limits, make_first_features, what_is_missing
 from mapless_server.settings import Settings, available_cores
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.progress import Progress, tracked
@@ -46,8 +45,8 @@ class Matcher:
         """Describes the first features that a server with these settings has; UsageError if it has none."""
         try:
             features, extractor = make_first_features(settings)
-        except (ValueError, ImportError, WeightsError) as error:
-            raise UsageError(str(error)) from error
+        except UNUSABLE as error:
+            raise UsageError(what_is_missing(error)) from error
         return cls(extractor, OPTIONS[features].query_ratio, image_limits(settings))
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Tier
-from mapless_server.networks.weights import WeightsError, WeightsMissing
-from mapless_server.serve.assembly import engine_options, make_tiers, what_is_missing
+from mapless_server.serve.assembly import UNUSABLE, engine_options, make_tiers, what_is_missing
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call
 from mapless_server.services.capture.folder import calls_of
 from mapless_server.services.capture.recorder import circumstances_of
@@ -166,10 +165,8 @@ def _check_schema(database: Database) -> None:
 def _tiers(settings: Settings) -> tuple[Tier, ...]:
     try:
         return make_tiers(settings)
-    except (ImportError, WeightsMissing) as error:
+    except UNUSABLE as error:
         raise CaptureError(what_is_missing(error)) from error
-    except (ValueError, WeightsError) as error:
-        raise CaptureError(str(error)) from error
 
 
 def _replayed(
