@@ -23,7 +23,7 @@ Picture = NDArray[np.uint8]
 """Pixels (H, W, 3), RGB."""
 GOOD, WRONG = "#2ee6a6", "#ff6b2b"
 """Colours of matches that agree with a pose, and of those that do not."""
-RESIDUAL = "#ffe14d"
+RESIDUAL = "#ff4df0"
 MAX_GOOD, MAX_WRONG = 140, 30
 """Most lines of a pair of photographs; more hide one another."""
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200)

@@ -112,7 +112,7 @@ def _draw_points(axes: Axes, posed: Posed) -> str:
     middle = float(np.median(np.linalg.norm(posed.keypoints - projected, axis=-1)))
     return (
         f"{len(depth)} matched points, {middle:.2f} px (median) from where the pose puts them; "
-        f"yellow: that offset x {factor}"
+        f"magenta: that offset x {factor}"
     )
 
 

@@ -17,17 +17,19 @@ from .cases import (
     CROSSED_REFERENCES,
     EXPENSIVE_S,
     LIST,
+    ORIENTATIONS,
     Asked,
     candidates,
     doubtful,
+    held_photographs,
     other_places,
     turned_photographs,
     write_list,
 )
 from .serving import answers
-from .tables import by, by_angle
+from .tables import by, by_turn
 
-WHAT = ("other-place", "doubtful", "turned")
+WHAT = ("other-place", "doubtful", "turned", "held")
 
 
 def main() -> None:
@@ -71,10 +73,11 @@ def measure(arguments: argparse.Namespace) -> Sequence[Row]:
         "other-place": partial(other_places, references=arguments.references),
         "doubtful": candidates if arguments.list else doubtful,
         "turned": turned_photographs,
+        "held": held_photographs,
     }
     asked = list(asked_of[arguments.what](scenes))
     # Whole photographs: one that is asked turned, is asked at every angle.
-    each = len(ANGLES_DEG) if arguments.what == "turned" else 1
+    each = {"turned": len(ANGLES_DEG), "held": len(ORIENTATIONS)}.get(arguments.what, 1)
     asked = [it for i, it in enumerate(asked) if i // each % arguments.every == 0]
     return ask(answers(asked, arguments.store), arguments.json, len(asked))
 
@@ -95,7 +98,9 @@ def ask(answered: Iterable[Row], file: Path, count: int) -> Sequence[Row]:
 def table(what: str, rows: Sequence[Row]) -> list[str]:
     """The table of a file of answers."""
     if what == "turned":
-        return by_angle(rows)
+        return by_turn(rows, "angle_deg")
+    if what == "held":
+        return by_turn(rows, "orientation")
     if what == "doubtful":
         return by("references", lambda row: row["references_stored"], rows)
     return by("asked", lambda row: "in other places", rows)

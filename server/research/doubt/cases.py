@@ -1,5 +1,6 @@
 """The photographs that are asked: of other places, doubtful ones of their own place, and turned ones."""
 
+import io
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -7,6 +8,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
+
+from PIL import ExifTags, Image, ImageOps
 
 from mapless_tools.dataset import Frame
 from mapless_tools.output_files import write_json
@@ -26,6 +29,18 @@ CANDIDATES = 4
 """Photographs of a folder with each number of references, among which the list is made."""
 TURNED_PLACES = (KITCHEN, MEETING, BOX, "studio-flat", "fox-portrait")
 TURNED_REFERENCES, TURNED_EACH = 5, 20
+HELD_EACH = 4
+ORIENTATIONS = {
+    1: (False, 0),
+    2: (True, 0),
+    3: (False, 180),
+    4: (True, 180),
+    5: (True, 270),
+    6: (False, 90),
+    7: (True, 90),
+    8: (False, 270),
+}
+"""EXIF's, and how the upright raster is stored: whether mirrored, after it was turned counterclockwise."""
 ANGLES_DEG = (0, 30, 45, 60, 90, 135, 180)
 
 
@@ -96,6 +111,33 @@ def _turned(folder: str, place: Place, frame: Frame, angle_deg: int) -> Asked:
     image = partial(turned_image, frame.image_path, frame.camera, angle_deg)
     case = replace(case, image=image, camera=camera, true_pose=pose)
     return Asked(case, {"folder": folder, "photograph": frame.name, "angle_deg": angle_deg})
+
+
+def held_photographs(scenes: Scenes) -> Iterator[Asked]:
+    """Photographs of five places as cameras store them that are held in every way, upright by their EXIF."""
+    for (folder,) in scenes.present([(it,) for it in TURNED_PLACES]):
+        place = scenes.place(folder, TURNED_REFERENCES)
+        for frame in place.queries(HELD_EACH):
+            for orientation in ORIENTATIONS:
+                yield _held(folder, place, frame, orientation)
+
+
+def _held(folder: str, place: Place, frame: Frame, orientation: int) -> Asked:
+    _, angle_deg = ORIENTATIONS[orientation]
+    camera, pose = turned(frame.camera, frame.world_from_camera, angle_deg)
+    case = _case("held", place, frame, f"{frame.name} in {place.scene} with orientation {orientation}")
+    case = replace(case, image=partial(_held_image, frame, orientation), camera=camera, true_pose=pose)
+    return Asked(case, {"folder": folder, "photograph": frame.name, "orientation": orientation})
+
+
+def _held_image(frame: Frame, orientation: int) -> bytes:
+    is_mirrored, angle_deg = ORIENTATIONS[orientation]
+    exif, file = Image.Exif(), io.BytesIO()
+    exif[ExifTags.Base.Orientation] = orientation
+    with Image.open(io.BytesIO(turned_image(frame.image_path, frame.camera, angle_deg))) as upright:
+        stored = ImageOps.mirror(upright) if is_mirrored else upright
+        stored.save(file, "PNG", exif=exif)
+    return file.getvalue()
 
 
 def _own(folder: str, count: int, place: Place, frame: Frame) -> Asked:

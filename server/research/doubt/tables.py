@@ -28,14 +28,16 @@ def _cells(rows: Sequence[Row]) -> list[object]:
     return [len(rows), right, wrong, f"{rejected}, {failed} failed" if failed else rejected, *times, f"{tried:.1f}"]
 
 
-def by_angle(rows: Sequence[Row]) -> list[str]:
-    """Outcomes at each angle, of photographs that are right at 0 degrees, and the cost by that there."""
-    upright = {_photograph(row): row for row in rows if row["angle_deg"] == 0 and row["outcome"] == "right"}
+def by_turn(rows: Sequence[Row], turn: str) -> list[str]:
+    """Outcomes at each turn, a field of the rows, of photographs right at the smallest, and the cost by that."""
+    turns = sorted({row[turn] for row in rows})
+    upright = {_photograph(row): row for row in rows if row[turn] == turns[0] and row["outcome"] == "right"}
     body = []
-    for angle_deg in sorted({row["angle_deg"] for row in rows}):
-        own = [row for row in rows if row["angle_deg"] == angle_deg and _photograph(row) in upright]
-        body.append([angle_deg, *_turned_cells(own, upright)])
-    head = "degrees | right at 0 | right | wrong | rejected | processor s, median | 95 % | by that at 0, median | sums"
+    for it in turns:
+        own = [row for row in rows if row[turn] == it and _photograph(row) in upright]
+        body.append([it, *_turned_cells(own, upright)])
+    first = f"at {turns[0]}"
+    head = f"{turn} | right {first} | right | wrong | rejected | processor s, median | 95 % | by that {first} | sums"
     return markdown_table(head, body)
 
 
