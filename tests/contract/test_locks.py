@@ -2,21 +2,13 @@
 
 import json
 import re
-import sys
-from pathlib import Path
 
 import pytest
+from support.project import PROJECT, ROOT
 
 from mapless_command.installation import IMAGE_EXTRAS
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-ROOT = Path(__file__).parents[2]
 LINES = [line for line in (ROOT / "requirements.lock").read_text().splitlines() if line[0] != "#"]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 WEB = ROOT / "client" / "web"
 
 

@@ -2,20 +2,13 @@
 
 import json
 import re
-import sys
-from pathlib import Path
 
 from packaging.version import Version
+from support.project import PROJECT, ROOT
 
 from mapless_server.store.tables import SCHEMA_VERSION
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-ROOT = Path(__file__).parents[2]
-VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+VERSION = str(PROJECT["version"])
 NUMBERS = VERSION.partition(".dev")[0]
 """For what knows no development versions: CMake and package.xml."""
 SCHEMAS = {"0.2.0": 3, "0.3.0": 9}

@@ -1,11 +1,9 @@
 """`mapless-server serve` has a flag for each setting; the commands of the server run without the tools' packages."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import typer.main
 from support.programs import printed
+from support.project import PROJECT
 from typer.testing import CliRunner
 
 from mapless_command.installation import how_to_install
@@ -84,17 +82,11 @@ def test_help_imports_nothing_heavy(module: str) -> None:
     assert printed(f"import sys, {module}; print([it for it in {heavy} if it in sys.modules])") == "[]\n"
 
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-PROJECT = Path(__file__).parents[2] / "pyproject.toml"
 DISTRIBUTION_OF = {"PIL": "pillow", "opentelemetry": "opentelemetry-sdk", "python_multipart": "python-multipart"}
 
 
 def test_every_extra_brings_its_packages() -> None:
-    brought = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    brought = PROJECT["optional-dependencies"]
     for package, extra in extras._EXTRA_OF.items():
         distribution = DISTRIBUTION_OF.get(package, package)
         assert any(requirement.startswith(f"{distribution}>=") for requirement in brought[extra]), package
