@@ -184,13 +184,10 @@ def _settings(data_dir: Path | None, connection: Connection) -> Settings:
 
 
 def _known_distance(text: str) -> KnownDistance:
-    from mapless_tools.dataset import named
-
-    from .metres import KnownDistance
+    from .metres import known_distance
 
     first, second, metres = text.split(DISTANCE_SEPARATOR)
-    with named(f"--distance {first} {second} {metres}"):
-        return KnownDistance(first, second, float(metres))
+    return known_distance(first, second, metres)
 
 
 def _intrinsics(text: str) -> Intrinsics | None:

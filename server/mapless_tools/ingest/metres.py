@@ -21,7 +21,7 @@ from mapless.geometry import MAX_COORDINATE_M, Array, Similarity
 from mapless.scenes import unit_vector
 from mapless.text_files import numbered_lines
 from mapless_server.scenes.plausibility import typical_down
-from mapless_tools.dataset import Dataset, Frame, finite_numbers
+from mapless_tools.dataset import Dataset, Frame, finite_numbers, named
 
 DISTANCE_SHARE, DISTANCE_M = 0.03, 0.02
 """A measured distance may differ from the scaled model's by 3 %, or by 2 cm if that is more: the precision of a tape
@@ -46,6 +46,12 @@ class KnownDistance:
     def __post_init__(self) -> None:
         if not 0 < self.metres < math.inf:
             raise ValueError(f"distance of {self.first} and {self.second}: must be above 0 m, is {self.metres:g}")
+
+
+def known_distance(first: str, second: str, metres: str) -> KnownDistance:
+    """The distance of a flag's three texts; ValueError, naming the flag, if it is no length."""
+    with named(f"--distance {first} {second} {metres}"):
+        return KnownDistance(first, second, float(finite_numbers(metres, "metres", ())))
 
 
 @dataclass(frozen=True)
@@ -79,15 +85,16 @@ def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> D
     """
     if not options:
         return dataset
-    find = Finder(dataset.frames, id_prefix)
+    find = Finder([located(frame, id_prefix) for frame in dataset.frames])
     if options.positions is not None:
-        metres_from_units, notes = _aligned(options.positions, find)
+        fit = align(find.all_of(read_positions(options.positions), str(options.positions)), str(options.positions))
+        metres_from_units, notes = fit.metres_from_units, [*fit.lines]
         if dataset.datum is not None:
             notes.append("the folder's datum is dropped: it is of the frame before the alignment")
             dataset = replace(dataset, datum=None)
     elif options.distances:
-        scale, notes = scale_of_distances(options.distances, find)
-        metres_from_units = Similarity(scale, np.eye(3), np.zeros(3))
+        measured = scale_of_distances(options.distances, find)
+        metres_from_units, notes = measured.metres_from_units, [*measured.lines]
     else:
         assert options.scale is not None
         metres_from_units, notes = Similarity(options.scale, np.eye(3), np.zeros(3)), []
@@ -103,8 +110,21 @@ def in_metres(dataset: Dataset, options: MetreOptions, id_prefix: str = "") -> D
     return replace(dataset, frames=frames, metric=True, down_in_world=down, notes=(*dataset.notes, *notes))
 
 
-def scale_of_distances(distances: Sequence[KnownDistance], find: "Finder") -> tuple[float, list[str]]:
-    """Metres per unit, by least squares in units of bounds, and a line for each; ValueError if they contradict."""
+@dataclass(frozen=True, eq=False)
+class MetreFit:
+    """A similarity to metres that was fitted to known values, and a line for each of these.
+
+    `scale_sigma` is the relative standard deviation of its scale, `residual_m` the root mean square of the differences.
+    """
+
+    metres_from_units: Similarity
+    scale_sigma: float
+    residual_m: float
+    lines: tuple[str, ...]
+
+
+def scale_of_distances(distances: Sequence[KnownDistance], find: "Finder") -> MetreFit:
+    """Fits the scale by least squares in units of bounds, of two standard deviations; ValueError if they contradict."""
     units = np.array([_length_in_units(it, find) for it in distances])
     metres = np.array([it.metres for it in distances])
     bounds = np.maximum(DISTANCE_SHARE * metres, DISTANCE_M)
@@ -124,7 +144,9 @@ def scale_of_distances(distances: Sequence[KnownDistance], find: "Finder") -> tu
         for name, known, off in zip(names, metres, differences, strict=True)
     ]
     if (np.abs(differences) <= bounds).all():
-        return scale, lines
+        sigma = 1 / (scale * math.sqrt(float((units**2 / (bounds / 2) ** 2).sum())))
+        only_scale = Similarity(scale, np.eye(3), np.zeros(3))
+        return MetreFit(only_scale, sigma, float(np.sqrt((differences**2).mean())), tuple(lines))
     guilty = _outlier(names, lambda chosen: np.abs(residuals(fit(chosen))) / bounds, least=3)
     raise ValueError(
         f"the known distances contradict each other by more than {100 * DISTANCE_SHARE:.0f} % and "
@@ -172,60 +194,73 @@ def read_positions(file: Path) -> dict[str, Array]:
     return found
 
 
+@dataclass(frozen=True, eq=False)
+class Located:
+    """A camera centre (3,), units, with the id and the other names by which it may be called."""
+
+    name: str
+    other_names: tuple[str, ...]
+    files: tuple[str, ...]
+    centre: Array
+
+
+def located(frame: Frame, id_prefix: str = "") -> Located:
+    """The camera centre of a frame, which may be called by its original or its new id, or by its photograph's name."""
+    new = f"{id_prefix}{frame.name}"
+    return Located(frame.name, (new,), (frame.image_path.name,), frame.world_from_camera.translation)
+
+
 class Finder:
-    """Finds frames by their original or their new ids, or by their photographs' file names."""
+    """Finds camera centres by ids, other names, and names of files that only one of them has."""
 
-    def __init__(self, frames: Sequence[Frame], id_prefix: str) -> None:
-        self._frames: dict[str, Frame] = {}
-        files = Counter(frame.image_path.name for frame in frames)
-        for frame in frames:
-            if files[frame.image_path.name] == 1:
-                self._frames[frame.image_path.name] = frame
-        self._frames |= {f"{id_prefix}{frame.name}": frame for frame in frames} | {it.name: it for it in frames}
+    def __init__(self, centres: Sequence[Located]) -> None:
+        files = Counter(file for it in centres for file in set(it.files))
+        self._centres = {file: it for it in centres for file in it.files if files[file] == 1}
+        self._centres |= {name: it for it in centres for name in it.other_names} | {it.name: it for it in centres}
 
-    def __call__(self, name: str) -> Frame:
-        """Returns the frame of a name; ValueError if there is none."""
-        if name not in self._frames:
-            known = ", ".join(sorted(frame.name for frame in set(self._frames.values()))[:3])
+    def __call__(self, name: str) -> Located:
+        """Returns the camera centre of a name; ValueError if there is none."""
+        if name not in self._centres:
+            known = ", ".join(sorted(it.name for it in set(self._centres.values()))[:3])
             raise ValueError(f"the folder has no reference {name!r}, by its id or file name; it has {known}, ...")
-        return self._frames[name]
+        return self._centres[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._centres
+
+    def all_of(self, known: Mapping[str, Array], where: str) -> dict[str, tuple[Array, Array]]:
+        """Pairs of known positions with camera centres, by name; ValueError if one is unknown, or named twice."""
+        found = {name: self(name) for name in known}
+        if len({it.name for it in found.values()}) < len(found):
+            raise ValueError(f"{where} names a reference twice, by its id and by its file")
+        return {name: (known[name], it.centre) for name, it in found.items()}
 
     @property
     def extent(self) -> float:
         """Largest difference of the camera centres' coordinates, units."""
-        centres = np.array([frame.world_from_camera.translation for frame in self._frames.values()])
-        return float(np.ptp(centres, axis=0).max())
+        return float(np.ptp([it.centre for it in self._centres.values()], axis=0).max())
 
 
 def _length_in_units(distance: KnownDistance, find: Finder) -> float:
-    first, second = (find(name).world_from_camera.translation for name in (distance.first, distance.second))
+    first, second = (find(name).centre for name in (distance.first, distance.second))
     length = float(np.linalg.norm(first - second))
     if not length > PLACE_SHARE * find.extent:
         raise ValueError(f"{distance.first} and {distance.second} are at one place: their distance gives no scale")
     return length
 
 
-def _aligned(file: Path, find: Finder) -> tuple[Similarity, list[str]]:
-    known = read_positions(file)
-    frames = {name: find(name) for name in known}
-    if len({frame.name for frame in frames.values()}) < len(frames):
-        raise ValueError(f"{file} names a reference twice, by its id and by its file")
-    return align(known, {name: frame.world_from_camera.translation for name, frame in frames.items()}, str(file))
+def align(pairs: Mapping[str, tuple[Array, Array]], where: str) -> MetreFit:
+    """Fits the similarity to pairs, by name, of a known camera centre (3,), metres, and the same in units.
 
-
-def align(known: Mapping[str, Array], centres: Mapping[str, Array], where: str) -> tuple[Similarity, list[str]]:
-    """Fits the similarity from the folder's frame and unit to known camera centres (3,), metres, of the same names.
-
-    Also returns a line for each. ValueError, beginning with `where`, if they are too few, collinear, or contradict each
-    other.
+    ValueError, beginning with `where`, if they are too few, collinear, or contradict each other.
     """
-    names = list(known)
+    names = list(pairs)
     if len(names) < 3:
         raise ValueError(
             f"{where} has {len(names)} known positions: three that are not on one line are needed, or --distance, "
             "which gives the scale alone"
         )
-    source, target = np.array([centres[name] for name in names]), np.array([known[name] for name in names])
+    target, source = (np.array([pair[i] for pair in pairs.values()]) for i in range(2))
     extent_m = float(np.linalg.norm(target[:, None] - target[None], axis=2).max())
     bound_m = max(POSITION_SHARE * extent_m, POSITION_M)
     for points, text in ((target, "known positions"), (source, "cameras of the known positions")):
@@ -247,8 +282,11 @@ def align(known: Mapping[str, Array], centres: Mapping[str, Array], where: str) 
             f"({100 * POSITION_SHARE:.0f} % of {extent_m:.3g} m, at least {100 * POSITION_M:.0f} cm): "
             f"{'; '.join(lines)}{likely}"
         )
-    _check_spread(target, float(np.sqrt((off_m**2).mean())), f"{where}: the known positions")
-    return umeyama(source, target), lines
+    residual_m = float(np.sqrt((off_m**2).mean()))
+    _check_spread(target, residual_m, f"{where}: the known positions")
+    freedom, spread_m = 3 * len(names) - 7, float(np.linalg.norm(target - target.mean(axis=0)))
+    sigma = float(np.linalg.norm(off_m)) / math.sqrt(freedom) / spread_m
+    return MetreFit(umeyama(source, target), sigma, residual_m, tuple(lines))
 
 
 def _check_spread(points: Array, residual: float, what: str) -> None:
