@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.scenes import Vector
 from mapless_server.images.exif import NO_EXIF, Exif
@@ -86,7 +87,7 @@ class WorldFrame:
     """The unit, origin and up of a reconstruction after what was known was applied, and how they were found.
 
     `down_in_world` is a unit vector, None if nothing says which way is down. `scale_sigma` is the relative standard
-    deviation of lengths; meaningful where `is_metric`.
+    deviation of lengths; meaningful where `is_metric`. `datum` is None if the place or north is not known.
     """
 
     is_metric: bool
@@ -94,3 +95,4 @@ class WorldFrame:
     down_in_world: Vector | None
     notes: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+    datum: Datum | None = None
