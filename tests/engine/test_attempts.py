@@ -33,6 +33,7 @@ from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionRe
 from mapless_server.scenes import Narrowing
 from mapless_server.scheduling import Flow, failing
 from mapless_server.scheduling.failing import FAILURES
+from mapless_server.store import SceneAttributes, SceneState
 
 
 def ended(result: Result) -> list[tuple[str, str, bool]]:
@@ -178,7 +179,7 @@ def test_a_photograph_of_a_group_keeps_the_matches_it_has(setting: Setting, is_p
     found = tuple(Failed(it, answer, Doubt.STARVED) for it, answer in zip(attempts, answers, strict=True))
     query = replace(query_of(("r0", "r1")), is_part=is_part)
     begun: Search = setting.engine.query_job(query, caller()).step.payload
-    material = Material(Attempt(), begun.views, unused, (), 1)
+    material = Material(Attempt(), begun.views, unused, (), SceneState(1, 0, SceneAttributes), SceneAttributes())
     verdict = decide(found, Priors())
     search = replace(begun, found=found, materials=(material,) * 2, tried=attempts, verdict=verdict)
     search = replace(search, attempts=tuple(Tried(str(i), "", "", 0.0, 0.0) for i in range(2)))

@@ -9,6 +9,7 @@ import pytest
 from support.groups import MATCH, NOTHING, drifting, images_of, looking
 from support.scenes import random_for
 
+from mapless_server.engine.failures import SceneMadeAnew
 from mapless_server.engine.joint import pose_rig, pose_sequence
 from mapless_server.engine.query import Query, Result
 from mapless_server.method.bundle.priors import NO_PRIORS
@@ -17,24 +18,34 @@ from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
-from mapless_server.store import SceneAttributes
+from mapless_server.store import SceneAttributes, SceneState
 
 CAMERAS = looking((-0.5, 0, -4), (0.2, -0.1, -4.2), (0.6, 0.2, -3.9))
 CONTRADICTION = "the scene contradicts itself: of 20 pairs of references that show the same, 3 agree"
 
 
-def joint(kind: str, images: Sequence[GroupImage], contradiction: str) -> RigEstimate | SequenceEstimate | Rejection:
-    """The joint pose of photographs in a scene of which this is said."""
+def joint(
+    kind: str,
+    images: Sequence[GroupImage],
+    contradiction: str = "",
+    made: Sequence[tuple[int, bool]] = ((0, False),) * 3,
+) -> RigEstimate | SequenceEstimate | Rejection:
+    """The joint pose of photographs in a scene of which this is said; when it was made, and whether it has metres."""
     pipeline = SimpleNamespace(
         options=SimpleNamespace(match=lambda *_: MATCH),
         matcher=SimpleNamespace(options=SimpleNamespace(guided_similarity=0.7)),
     )
     narrowing = SimpleNamespace(contradiction=lambda *_: "")
     query = SimpleNamespace(options=SimpleNamespace(coverage=0.95), priors=NO_PRIORS, narrowing=narrowing)
-    attributes = SceneAttributes(contradiction=contradiction)
     results = [
-        SimpleNamespace(answer=it.answer, tier=SimpleNamespace(pipeline=pipeline), attributes=attributes, references=())
-        for it in images
+        SimpleNamespace(
+            answer=it.answer,
+            tier=SimpleNamespace(pipeline=pipeline),
+            scene=SceneState(1, create_time_us, SceneAttributes),
+            attributes=SceneAttributes(contradiction=contradiction, arbitrary_unit=is_arbitrary),
+            references=(),
+        )
+        for it, (create_time_us, is_arbitrary) in zip(images, made, strict=True)
     ]
     given = cast(list[Query], [query] * len(images)), cast(list[Result], results)
     if kind == "rig":
@@ -88,3 +99,13 @@ def test_every_joint_rejection_says_the_contradiction_once(kind: str) -> None:
         assert found.hint is not None
         assert found.hint.advice is Advice.CHECK_REFERENCE_POSES
         assert found.message.count(CONTRADICTION) == 1
+
+
+@pytest.mark.parametrize("last", [(8, False), (7, True)], ids=["made anew", "another unit"])
+def test_photographs_of_two_scenes_have_no_joint_pose(
+    kind: str, images: list[GroupImage], last: tuple[int, bool]
+) -> None:
+    agreeing = with_errors(images, lambda i, j: 0.4)
+    assert not isinstance(joint(kind, agreeing, made=[(7, False)] * 3), Rejection)
+    with pytest.raises(SceneMadeAnew):
+        joint(kind, agreeing, made=[(7, False), (7, False), last])

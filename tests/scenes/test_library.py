@@ -80,8 +80,8 @@ def context(seconds: float = 60.0, is_abandoned: Callable[[], bool] = lambda: Fa
 
 class TestPhotographs:
     def test_are_read_on_first_use(self, store: CountingStore) -> None:
-        generation, references = ReferenceLibrary(store).load(SCENE, IDS[::-1], OLD, context())
-        assert generation == store.get_scene(SCENE).generation
+        scene, references = ReferenceLibrary(store).load(SCENE, IDS[::-1], OLD, context())
+        assert scene.generation == store.get_scene(SCENE).generation
         assert [it.name for it in references] == [f"scenes/s/references/{it}" for it in IDS[::-1]]
         assert store.images_read == 0
         for count, (reference_id, reference) in enumerate(zip(IDS[::-1], references, strict=True), start=1):
@@ -126,8 +126,10 @@ class TestDescribing:
         for ids, described in ((["r2"], 1), (["r2", "r1"], 2), (IDS, 4), (IDS[::-1], 4)):
             library = ReferenceLibrary(store)  # what is known is in the store
             call = context()
-            found, references = library.load(SCENE, ids, new, call)
-            assert found == generation == store.get_scene(SCENE).generation, "features are no change of the scene"
+            scene, references = library.load(SCENE, ids, new, call)
+            assert scene.generation == generation == store.get_scene(SCENE).generation, (
+                "features are no change of the scene"
+            )
             assert [it.name.rpartition("/")[2] for it in references] == ids
             for reference_id, reference in zip(ids, references, strict=True):
                 np.testing.assert_array_equal(reference.view.features.keypoints, expected[reference_id])

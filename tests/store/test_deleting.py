@@ -356,7 +356,7 @@ class TestMemory:
     """Of scenes that are deleted nothing is held; of others all."""
 
     def used_bytes(self, store: Store) -> tuple[int, ...]:
-        return tuple(it.used for it in (store.reference_cache, store._resolved, store._attributes))
+        return tuple(it.used for it in (store.reference_cache, store._resolved, store._scenes))
 
     @pytest.mark.parametrize("what", ["scene", "reference"])
     def test_what_is_being_read_meanwhile_is_not_remembered(

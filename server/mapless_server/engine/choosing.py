@@ -33,9 +33,10 @@ from mapless_server.scenes import Choice, Narrowing, Selection
 from mapless_server.scenes.library import Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
 from mapless_server.scheduling import Abandoned, Failure
+from mapless_server.store import SceneAttributes, SceneState
 
 from . import tracking
-from .failures import failure_of
+from .failures import SceneMadeAnew, failure_of
 from .query import MIRROR, Tier
 from .search import Search
 
@@ -87,6 +88,23 @@ def load_chosen(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loa
         return _load(search, reference_ids, tier)
     report = partial(search.source.report_damaged, search.query.scene_key)
     return load_usable(lambda some: _load(search, some, tier), reference_ids, (DataLoss,), report)
+
+
+def attributes_of(search: Search, scene: SceneState) -> SceneAttributes:
+    """The attributes of a scene, as far as they count for the search's query; DataLoss if they are damaged.
+
+    SceneMadeAnew unless they mean what those mean by which the query's priors were converted.
+    """
+    attributes, known = scene.attributes, search.query.attributes
+    if known is not None and known.world != attributes.world:
+        raise SceneMadeAnew
+    if contradiction := search.source.contradiction(search.query.scene_key):
+        attributes = replace(attributes, contradiction=contradiction)
+    if search.query.is_generic:
+        attributes = replace(attributes, calibration=None, self_calibrations=())
+    if attributes.contradiction:  # radii and trust measured by its references say nothing
+        attributes = replace(attributes, self_calibrations=())
+    return attributes
 
 
 def compared(search: Search) -> Search:
@@ -222,15 +240,18 @@ def _outside(search: Search, choice: Choice, tier: Tier) -> list[tuple[str, int]
 
 def _named(search: Search, views: QueryViews, tier: Tier) -> Material:
     # References come first: a wrong name is found before the photograph is described.
-    generation, references = _load(search, search.query.reference_ids, tier)
-    return Material(search.attempt.basis, views, views.view(tier.extractor, search.context), references, generation)
+    scene, references = _load(search, search.query.reference_ids, tier)
+    attributes = attributes_of(search, scene)
+    view = views.view(tier.extractor, search.context)
+    return Material(search.attempt.basis, views, view, references, scene, attributes)
 
 
 def _chosen(search: Search, views: QueryViews, tier: Tier, any_roll: int | None) -> Material:
     """Chooses, among the references that resemble the photograph most, those with the most matches."""
     query, context = search.query, search.context
     choice = _rolled_choice(search, any_roll) or _shortlisted(search, views, _narrowing_of(search), tier)
-    generation, shortlist = load_chosen(search, [it.reference_id for it in choice.references], tier)
+    scene, shortlist = load_chosen(search, [it.reference_id for it in choice.references], tier)
+    attributes = attributes_of(search, scene)
     view = views.view(tier.extractor, context)
 
     def choose(indices: Sequence[int], match_counts: Sequence[int]) -> list[int]:
@@ -241,7 +262,7 @@ def _chosen(search: Search, views: QueryViews, tier: Tier, any_roll: int | None)
         matcher = tier.pipeline.matcher
         matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check)
     chosen, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
-    return Material(search.attempt.basis, views, view, chosen, generation, choice, query_matches)
+    return Material(search.attempt.basis, views, view, chosen, scene, attributes, choice, query_matches)
 
 
 def _rolled_choice(search: Search, any_roll: int | None) -> Choice | None:
@@ -265,9 +286,14 @@ def _shortlisted(search: Search, views: QueryViews, narrowing: Narrowing, tier: 
 
 
 def _load(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loaded:
+    """Loads references; SceneMadeAnew unless they are of the scene that the search's other references are of."""
     # Only before a first result the features of references are waited for.
     waits = not search.found
-    return search.source.load(search.query.scene_key, reference_ids, tier.extractor, search.context, waits)
+    loaded = search.source.load(search.query.scene_key, reference_ids, tier.extractor, search.context, waits)
+    used = {it.scene.create_time_us for it in (search.material, *search.materials) if it is not None}
+    if used - {loaded[0].create_time_us}:
+        raise SceneMadeAnew
+    return loaded
 
 
 def _mirrored(most: int, not_mirrored: int, reference: str) -> Rejection:

@@ -9,8 +9,17 @@ from mapless_server.errors import (
     NotFound,
     PermissionDenied,
     Unauthenticated,
+    Unavailable,
 )
 from mapless_server.scheduling import Failure
+
+
+class SceneMadeAnew(Unavailable):
+    """The scene was deleted and created again during the call, or its poses mean something else since."""
+
+    def __init__(self) -> None:
+        super().__init__("the scene was changed during the call", reason="SCENE_CHANGED", retry_after_s=1.0)
+
 
 _CALLERS = (InvalidArgument, Unauthenticated, PermissionDenied, NotFound, AlreadyExists, FailedPrecondition)
 """The caller's mistakes. Other errors of requests are sent to callers, too, but are the server's."""

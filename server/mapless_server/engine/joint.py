@@ -12,13 +12,15 @@ from mapless_server.method.judge.references import with_contradiction, without_a
 from mapless_server.method.options import Variant
 from mapless_server.method.rejection import Rejection, RejectionReason
 
+from .failures import SceneMadeAnew
 from .query import Query, Result
 
 
 def pose_rig(
     queries: Sequence[Query], results: Sequence[Result], rig_from_camera: Sequence[RigidTransform]
 ) -> RigEstimate | Rejection:
-    """Estimates the pose of the rig that took the photographs, given in order."""
+    """Estimates the pose of the rig that took the photographs, given in order; SceneMadeAnew as `_check_scene`."""
+    _check_scene(results)
     found = _rig(queries, results, rig_from_camera)
     return with_contradiction(found, _contradiction(results)) if isinstance(found, Rejection) else found
 
@@ -29,9 +31,17 @@ def pose_sequence(
     session_from_camera: Sequence[RigidTransform],
     estimate_scale: bool,
 ) -> SequenceEstimate | Rejection:
-    """Estimates the poses of a sequence's frames, in order, in OpenCV's axes."""
+    """Estimates the poses of a sequence's frames, in order, in OpenCV's axes; SceneMadeAnew as `_check_scene`."""
+    _check_scene(results)
     found = _sequence(queries, results, session_from_camera, estimate_scale)
     return with_contradiction(found, _contradiction(results)) if isinstance(found, Rejection) else found
+
+
+def _check_scene(results: Sequence[Result]) -> None:
+    """Raises SceneMadeAnew unless all photographs were localized in one scene, whose poses meant the same to all."""
+    scenes = [(it.scene.create_time_us, it.attributes.world) for it in results]
+    if any(it != scenes[0] for it in scenes):
+        raise SceneMadeAnew
 
 
 def _rig(

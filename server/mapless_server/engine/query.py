@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.scenes import Choice, Narrowing, Vector
     from mapless_server.scheduling import Flow
     from mapless_server.security import SceneKey
+    from mapless_server.store import SceneState
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +157,8 @@ class Query:
         priors: priors on the pose, each with its uncertainty, in the scene's world.
         is_part: whether it belongs to a rig or a sequence, which needs its matches even if it cannot be localized
             alone.
+        is_generic: whether what was measured in the scene is not used for radii and trust.
+        attributes: the scene's attributes by which the priors were converted to its world; None if by none.
     """
 
     scene_key: SceneKey
@@ -169,6 +172,7 @@ class Query:
     priors: Priors = NO_PRIORS
     is_part: bool = False
     is_generic: bool = False
+    attributes: SceneAttributes | None = None
 
     @property
     def chooses(self) -> bool:
@@ -244,11 +248,11 @@ class Result:
         answer: the answer of the method.
         tier: the tier that computed it.
         references: the references that were used, in order.
-        generation: generation of the scene when the references were read.
+        scene: the scene as it was when the references were read.
         processed: the camera of the reduced image that features were found in.
         choice: how the references were chosen; None if the caller named them.
         other_choices: how other attempts chose theirs by other descriptors, in order.
-        attributes: attributes of the scene.
+        attributes: attributes of the scene, as far as they count for the query.
         stage_seconds: time of every stage that was computed, in order, of all attempts. The name of a stage of other
             features, references or rasters than the first ones begins with the extractor's name and a slash.
         attempts: the attempts that were made, in order.
@@ -258,7 +262,7 @@ class Result:
     answer: Answer
     tier: Tier
     references: tuple[PosedView, ...]
-    generation: int
+    scene: SceneState
     processed: Camera
     choice: Choice | None = None
     other_choices: tuple[Choice, ...] = ()
@@ -266,6 +270,11 @@ class Result:
     stage_seconds: dict[str, float] = field(default_factory=dict)
     attempts: tuple[Tried, ...] = ()
     cuts: tuple[LadderCut, ...] = ()
+
+    @property
+    def generation(self) -> int:
+        """Generation of the scene when the references were read."""
+        return self.scene.generation
 
     @property
     def is_tracked(self) -> bool:

@@ -16,7 +16,6 @@ from mapless_server.scenes.retrieval.index import GlobalDescriptor
 from mapless_server.scenes.retrieval.ranking import nearest_references
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey
-from mapless_server.store import SceneAttributes
 from mapless_server.store.queries import reference_not_found
 
 from .query import POSE_PRIOR
@@ -60,11 +59,9 @@ class References:
         self._extractors = extractors
         self._limits = limits
 
-    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Returns the attributes of a scene, with its contradiction as far as it is known; errors as in `Store`."""
-        attributes = self._tools.library.attributes(scene_key)
-        contradiction = self.agreements.known(scene_key).contradiction
-        return replace(attributes, contradiction=contradiction) if contradiction else attributes
+    def contradiction(self, scene_key: SceneKey) -> str:
+        """Returns the sentence that a scene contradicts itself, as far as it is known; else an empty one."""
+        return self.agreements.known(scene_key).contradiction
 
     def choose(
         self,

@@ -15,7 +15,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.method.rejection import PoseHypothesis
 from mapless_server.scenes import Choice
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
-from mapless_server.store import SceneAttributes
+from mapless_server.store import SceneAttributes, SceneState
 
 from .query import PREPARE, REFINE, CutReason, LadderCut, Query, Result, Tried
 from .source import ReferenceSource
@@ -35,7 +35,8 @@ class Material:
         views: the photograph in their raster.
         view: its features.
         references: the references that are used, in order.
-        generation: generation of the scene when they were read.
+        scene: the scene as it was when they were read.
+        attributes: its attributes, as far as they count for the query.
         choice: how they were chosen; None if the caller named them.
         query_matches: matches of the photograph with each reference, if they were chosen by these.
         is_strong: whether these are to be those of a network, as far as nearest neighbours find few.
@@ -48,7 +49,8 @@ class Material:
     views: QueryViews
     view: View
     references: tuple[PosedView, ...]
-    generation: int
+    scene: SceneState
+    attributes: SceneAttributes
     choice: Choice | None = None
     query_matches: tuple[Matches, ...] | None = None
     is_strong: bool = False
@@ -115,7 +117,6 @@ class Search:
         start_s: when the attempt began to wait for the queue, by `time.monotonic`.
         give_up_s: time after which the verdict so far is the answer, if the attempt has no result by then.
         listings: how often the scene was listed in the attempt.
-        attributes: attributes of the scene.
         context: cancels and times the computation from the photograph and references of the attempt.
         spent_s: time of each stage of the computations before it.
         computed_s, processor_s: time and processor time of the attempt until its present stage.
@@ -146,7 +147,6 @@ class Search:
     start_s: float = field(default_factory=time.monotonic)
     give_up_s: float = math.inf
     listings: int = 1
-    attributes: SceneAttributes = field(default_factory=SceneAttributes)
     context: StageContext = field(default_factory=StageContext)
     spent_s: Mapping[str, float] = field(default_factory=dict)
     computed_s: float = 0.0
@@ -171,6 +171,11 @@ class Search:
         """The search at its first attempt."""
         rung, attempt = first_attempt(query.can_be_tracked)
         return cls(query, source, views, deadline_s, on_better, rung, attempt)
+
+    @property
+    def attributes(self) -> SceneAttributes:
+        """The attributes of the scene that the attempt's references are of."""
+        return (self.material or self.materials[-1]).attributes
 
     @property
     def may_be_elsewhere(self) -> bool:

@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from mapless_server.scenes import Choice, Selection
     from mapless_server.scenes.library import Loaded
     from mapless_server.security import SceneKey
-    from mapless_server.store import SceneAttributes
 
     from .photo_views import QueryViews
 
@@ -27,11 +26,11 @@ class ReferenceSource(Protocol):
         context: StageContext,
         waits: bool,
     ) -> Loaded:
-        """Loads references of a scene, in the order given, with the scene's generation."""
+        """Loads references of a scene, in the order given, with the scene as it was when they were read."""
         ...
 
-    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Returns the attributes of a scene."""
+    def contradiction(self, scene_key: SceneKey) -> str:
+        """Returns the sentence that a scene contradicts itself, if that is known; else an empty one."""
         ...
 
     def choose(

@@ -51,7 +51,7 @@ from .failures import failure_of
 from .query import COARSE, PREPARE, REFINE, TRACK, CutReason, LadderCut, Result, Tier
 from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
 from .situation import any_roll_of, situation_of
-from .verdicts import Verdicts, attributes_of
+from .verdicts import Verdicts
 
 log = logging.getLogger(__name__)
 
@@ -185,8 +185,6 @@ class QueryStages:
     def _described(self, search: Search) -> Search | SearchResult:
         """The search with what its attempt is computed from; or what follows if there is nothing to compute."""
         attempt = search.attempt
-        if not search.found:
-            search = replace(search, attributes=attributes_of(search))
         if attempt.where is Where.NEAR_PRIOR:
             return self._tracked(search)
         if attempt.raster is Raster.MIRRORED:
@@ -295,11 +293,13 @@ class QueryStages:
             self._verdicts.tier(search.attempt),
             search.views.in_form(RasterForm(max_pixels=tracking.MAX_PIXELS)),
         )
-        generation, references = choosing.load_chosen(search, [it.reference_id for it in near.references], tier)
+        scene, references = choosing.load_chosen(search, [it.reference_id for it in near.references], tier)
         view, matcher = views.view(tier.extractor, context), tier.pipeline.matcher
         with context.stage("correspond"):
             matches = tuple(matcher.match_quickly(view, references, context.check))
-        material = Material(search.attempt.basis, views, view, references, generation, near, matches)
+        attributes = choosing.attributes_of(search, scene)
+        material = Material(search.attempt.basis, views, view, references, scene, attributes, near, matches)
+        search = replace(search, material=material)
         given = view, references, self._verdicts.pipeline(search, tier)
         prepared = pipeline.prepare(*given, query.options, context, matches, query.priors)
         if isinstance(prepared, Rejection):
@@ -308,7 +308,6 @@ class QueryStages:
         if isinstance(coarse, Exception):
             raise coarse
         doubt = self._verdicts.doubt_in(search)
-        search = replace(search, material=material)
         found = self._verdicts.within_limits(search, solve(coarse, search.attempt, doubt))
         if not isinstance(found, Hypothesis) or tracking.doubts_of_tracked(found, doubt):
             return None

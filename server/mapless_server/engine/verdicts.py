@@ -15,7 +15,6 @@ from mapless_server.method.options import DoubtOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.scenes import ANYWHERE, Choice
-from mapless_server.store import SceneAttributes
 
 from . import tracking
 from .query import CutReason, Result, Tier, Tried
@@ -100,7 +99,7 @@ class Verdicts:
         compares: bool = True,
     ) -> Result:
         """The result of an attempt with an outcome, whose hint says what would help."""
-        answer, contradiction = replace(found.answer, outcome=outcome), search.attributes.contradiction
+        answer, contradiction = replace(found.answer, outcome=outcome), material.attributes.contradiction
         if isinstance(outcome, Rejection):
             has_prior = material.is_searched and not search.query.narrowing.is_empty
             answer = hinted(answer, material.view, material.references, has_prior, compares)
@@ -110,11 +109,11 @@ class Verdicts:
             answer,
             self.tier(found.attempt),
             material.references,
-            material.generation,
+            material.scene,
             material.view.camera,
             material.choice,
             _other_choices(search, material),
-            search.attributes,
+            material.attributes,
             search.seconds(self.tier(search.attempt).features),
         )
 
@@ -138,13 +137,3 @@ def _with_unfinished(answer: Answer, attempts: Sequence[Tried]) -> Answer:
 
 def _rejected(found: Found, rejection: Rejection, doubts: Doubt) -> Found:
     return replace(found, answer=replace(found.answer, outcome=rejection), doubts=doubts)
-
-
-def attributes_of(search: Search) -> SceneAttributes:
-    """The attributes of the search's scene, as far as they count for its query."""
-    attributes = search.source.attributes(search.query.scene_key)
-    if search.query.is_generic:
-        attributes = replace(attributes, calibration=None, self_calibrations=())
-    if attributes.contradiction:  # radii and trust measured by its references say nothing
-        attributes = replace(attributes, self_calibrations=())
-    return attributes

@@ -23,7 +23,7 @@ from mapless_server.method.features.extractors.turned import extract_upright
 from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
 from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
-from mapless_server.store import DescribedReference, ReferenceRecord, SceneAttributes, Store
+from mapless_server.store import DescribedReference, ReferenceRecord, SceneState, Store
 
 from .stored import DepthFinder
 
@@ -31,8 +31,8 @@ log = logging.getLogger(__name__)
 
 _POLL_S = 0.05
 
-Loaded = tuple[int, tuple[PosedView, ...]]
-"""A scene's generation, and references of it."""
+Loaded = tuple[SceneState, tuple[PosedView, ...]]
+"""A scene and references of it, read at one moment."""
 
 
 class FeaturesMissing(Exception):
@@ -101,7 +101,7 @@ class ReferenceLibrary:
         context: StageContext,
         waits: bool = True,
     ) -> Loaded:
-        """Loads references of a scene, in the order given, with the scene's generation.
+        """Loads references of a scene, in the order given, with the scene as it was when they were read.
 
         References without features of the extractor are described now, one by one, and finished ones are kept if the
         context is cancelled; if `waits` is False, they are described in the background. Photographs are read when their
@@ -115,17 +115,13 @@ class ReferenceLibrary:
                 views = tuple(map(self.posed_view, snapshot.references))
                 if self._depths is not None:
                     views = self._depths.with_depths(views, extractor.name)
-                return snapshot.generation, views
+                return snapshot.scene, views
             if not waits:
                 self._describe_later(snapshot.undescribed, extractor)
                 raise FeaturesMissing
             _log_describing(snapshot.undescribed, extractor)
             with context.stage("describe"):
                 self._describe_all(snapshot.undescribed, extractor, context.check)
-
-    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Returns the attributes of a scene; errors as in `Store.get_attributes`."""
-        return self._store.get_attributes(scene_key)
 
     def _describe_later(self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
         with self._scheduling:

@@ -24,9 +24,10 @@ from mapless_server.method.features.views import Photograph, PosedView
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions, StageContext
 from mapless_server.scenes import Choice, Narrowing
+from mapless_server.scenes.library import Loaded
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
-from mapless_server.store import SceneAttributes
+from mapless_server.store import SceneAttributes, SceneState
 
 log = logging.getLogger(__name__)
 
@@ -119,9 +120,9 @@ class _RenderedReferences:
         extractor: FeatureExtractor,
         context: StageContext,
         waits: bool,
-    ) -> tuple[int, tuple[PosedView, ...]]:
+    ) -> Loaded:
         """See ReferenceSource."""
-        return 1, tuple(self._view(extractor, i) for i in range(len(_CENTRES_X_M)))
+        return SceneState(1, 0, SceneAttributes), tuple(self._view(extractor, i) for i in range(len(_CENTRES_X_M)))
 
     def _view(self, extractor: FeatureExtractor, number: int) -> PosedView:
         key = extractor.name, number
@@ -129,9 +130,9 @@ class _RenderedReferences:
             self._views[key] = _reference(extractor, number)
         return self._views[key]
 
-    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
+    def contradiction(self, scene_key: SceneKey) -> str:
         """See ReferenceSource."""
-        return SceneAttributes()
+        return ""
 
     def choose(self, *_: object) -> Choice:
         """See ReferenceSource."""

@@ -14,6 +14,7 @@ from mapless.geometry import MAX_COORDINATE_M, RigidTransform
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
+from mapless_server.engine.failures import SceneMadeAnew
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.rpc import Call
@@ -286,8 +287,12 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
                 raise FieldError(field, "is required")
         pose = wire.transform_from_message(request.world_from_camera, "world_from_camera", MAX_COORDINATE_M)
         view = Viewpoint(wire.camera_from_message(request.intrinsics, "intrinsics"), pose)
+        before = await self._stored(self._store.get_scene, scene_key)
         generation, coverage = await engine.check_coverage(scene_key, view, call.caller)
-        is_arbitrary = (await self._stored(self._store.get_scene, scene_key)).attributes.arbitrary_unit
+        scene = await self._stored(self._store.get_scene, scene_key)
+        is_arbitrary = scene.attributes.arbitrary_unit
+        if (scene.create_time, is_arbitrary) != (before.create_time, before.attributes.arbitrary_unit):
+            raise SceneMadeAnew
         return message_of(coverage, pb.CheckCoverageResponse, store_generation=generation, arbitrary_unit=is_arbitrary)
 
     def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:

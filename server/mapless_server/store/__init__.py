@@ -19,6 +19,7 @@ from .records import (
     SceneAttributes,
     SceneChanges,
     SceneRecord,
+    SceneState,
     SelfCalibration,
     calibration_kind,
 )

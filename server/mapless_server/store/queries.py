@@ -62,12 +62,6 @@ def find_scene(connection: Connection, scene_key: SceneKey) -> Row[Any]:
     return _one(connection, select_scenes().where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
 
 
-def find_attributes(connection: Connection, scene_key: SceneKey) -> Row[Any]:
-    """Columns `scene_id`, `attributes` and `attributes_sha256` of a scene; raises NotFound."""
-    statement: Select[Any] = select(scene.c.scene_id, scene.c.attributes, scene.c.attributes_sha256)
-    return _one(connection, statement.where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
-
-
 def find_calibrations(connection: Connection, scene_key: SceneKey) -> Sequence[Row[Any]]:
     """Columns of `scene_calibration` of a scene; empty if it has not been calibrated."""
     column = scene_calibration.c

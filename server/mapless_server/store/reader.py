@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial, wraps
 from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
 
@@ -18,7 +17,15 @@ from . import codec, queries, rows, tables
 from .alike import find_alike
 from .database import DamagedPages, Database, unavailable, unless_damaged
 from .queries import read_changes
-from .records import DescribedReference, ReferenceRecord, SceneAttributes, SceneChanges, SceneRecord, SceneSnapshot
+from .records import (
+    DescribedReference,
+    ReferenceRecord,
+    SceneAttributes,
+    SceneChanges,
+    SceneRecord,
+    SceneSnapshot,
+    SceneState,
+)
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -71,10 +78,10 @@ def observed(operation: Callable[Concatenate[Any, P], T]) -> Callable[Concatenat
 
 
 class _Resolved(NamedTuple):
-    """Keys of a scene's reference ids in a state of the store, with the scene's generation."""
+    """Keys of a scene's reference ids in a state of the store, with the scene in that state."""
 
     state: object
-    generation: int
+    scene: SceneState
     keys: tuple[str, ...]
 
 
@@ -96,7 +103,7 @@ class StoreReader:
         # By scene key and ids. Where this process alone writes, an entry is valid until anything is written (`_state`),
         # and the database is not asked at all; where others write too, as long as the generation is the same.
         self._resolved: LruCache[_Resolved] = LruCache(name_cache_bytes)
-        self._attributes: LruCache[tuple[object, SceneAttributes]] = LruCache(name_cache_bytes)
+        self._scenes: LruCache[tuple[object, SceneState]] = LruCache(name_cache_bytes)
         self._state = object()
         self._last_deletion = object()
 
@@ -140,16 +147,23 @@ class StoreReader:
         DataLoss if the attributes are damaged.
         """
         state = self._state
-        cached = None if self.database.is_shared else self._attributes.get(scene_key)
+        cached = None if self.database.is_shared else self._scenes.get(scene_key)
         if cached is not None and cached[0] is state:
-            return cached[1]
+            return cached[1].attributes
         with self.database.read() as connection:
-            row = queries.find_attributes(connection, scene_key)
-            found = queries.find_calibrations(connection, scene_key)
-        attributes = replace(rows.scene_attributes(row), self_calibrations=rows.self_calibrations(found))
+            scene = self._scene_state(connection, scene_key, state)
+        return scene.attributes
+
+    def _scene_state(self, connection: Connection, scene_key: SceneKey, state: object) -> SceneState:
+        """The scene as the connection's transaction sees it, begun in a state; from memory if nothing has changed."""
+        row, cached = queries.find_scene(connection, scene_key), self._scenes.get(scene_key)
+        if cached is not None and cached[0] is state and cached[1].generation == row.generation:
+            return cached[1]
+        found = queries.find_calibrations(connection, scene_key)
+        scene = SceneState(row.generation, row.create_time_us, partial(rows.answered_attributes, row, found))
         if not self.database.is_shared:
-            self._attributes.put(scene_key, (state, attributes), ATTRIBUTES_BYTES)
-        return attributes
+            self._scenes.put(scene_key, (state, scene), ATTRIBUTES_BYTES)
+        return scene
 
     @observed
     def list_scenes(self, tenant: str, limit: int, after: str = "") -> list[SceneRecord]:
@@ -251,7 +265,7 @@ class StoreReader:
     def load_references(
         self, scene_key: SceneKey, reference_ids: Sequence[str] | None, extractor: str
     ) -> SceneSnapshot:
-        """Loads references with their features, those without features, and the generation, all read at one moment.
+        """Loads references with their features, those without features, and the scene, all read at one moment.
 
         They are in the order of their ids' list; all, ordered by id, for None. References that were loaded before come
         from memory. NotFound if there is no such scene (field "scene") or reference (field "references[i]"); DataLoss
@@ -262,13 +276,13 @@ class StoreReader:
         resolved = None if names is None else self._resolved.get((scene_key, names))
         cached: dict[str, DescribedReference | None] = {}  # each is looked up once: hits and misses are counted
         if resolved is not None and resolved.state is state and not self.database.is_shared:
-            cached, snapshot = self._cached(resolved, extractor)
+            cached, snapshot = self._cached(resolved.keys, resolved.scene, extractor)
             if snapshot is not None:
                 return snapshot
         with self.database.read() as connection:
-            generation = queries.read_generation(connection, scene_key)
-            if resolved is not None and resolved.generation == generation and self.database.is_shared:
-                cached, snapshot = self._cached(resolved, extractor)
+            scene = self._scene_state(connection, scene_key, state)
+            if resolved is not None and resolved.scene.generation == scene.generation and self.database.is_shared:
+                cached, snapshot = self._cached(resolved.keys, scene, extractor)
                 if snapshot is not None:
                     return snapshot
             key_of = queries.find_keys(connection, scene_key, reference_ids)
@@ -285,7 +299,7 @@ class StoreReader:
             undescribed = queries.rows_by_key(connection, lacking)
         if names is not None:
             size_bytes = NAME_BYTES * (1 + len(names))
-            self._resolved.put((scene_key, names), _Resolved(state, generation, tuple(wanted)), size_bytes)
+            self._resolved.put((scene_key, names), _Resolved(state, scene, tuple(wanted)), size_bytes)
         for key, row in read.items():
             described[key] = rows.described_reference(row)
             self.reference_cache.put(
@@ -294,8 +308,9 @@ class StoreReader:
         if self._last_deletion is not last_deletion:  # these may have been deleted, and dropped from the caches before
             self.reference_cache.forget(lambda key, _: key[0] in read)
             self._resolved.forget(lambda key, _: key == (scene_key, names))
+            self._scenes.forget(lambda key, _: key == scene_key)
         return SceneSnapshot(
-            generation,
+            scene,
             tuple(described[key] for key in wanted if key in described),
             tuple(rows.reference_record(undescribed[key]) for key in lacking),
         )
@@ -310,13 +325,12 @@ class StoreReader:
             return read_changes(connection, scene_key, since_generation, descriptor_name)
 
     def _cached(
-        self, resolved: _Resolved, extractor: str
+        self, keys: Sequence[str], scene: SceneState, extractor: str
     ) -> tuple[dict[str, DescribedReference | None], SceneSnapshot | None]:
         """The cached features of references, by key; also as a snapshot, if all of them are cached."""
-        cached = {key: self.reference_cache.get((key, extractor)) for key in resolved.keys}
-        found = tuple(it for it in map(cached.get, resolved.keys) if it is not None)
-        is_complete = len(found) == len(resolved.keys)
-        return cached, SceneSnapshot(resolved.generation, found) if is_complete else None
+        cached = {key: self.reference_cache.get((key, extractor)) for key in keys}
+        found = tuple(it for it in map(cached.get, keys) if it is not None)
+        return cached, SceneSnapshot(scene, found) if len(found) == len(keys) else None
 
 
 def _read_features(connection: Connection, id_of: Mapping[str, str], extractor: str) -> dict[str, Row[Any]]:

@@ -1,9 +1,10 @@
 """The values that the store takes and returns."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,11 @@ class SceneAttributes:
     arbitrary_unit: bool = False
     self_calibrations: tuple[SelfCalibration, ...] = ()
     contradiction: str = ""
+
+    @property
+    def world(self) -> tuple[Datum | None, Vector | None, bool]:
+        """The attributes that say what a pose in its world means: datum, down and unit."""
+        return self.datum, self.down_in_world, self.arbitrary_unit
 
     @property
     def unit(self) -> str:
@@ -210,15 +216,40 @@ class DescribedReference:
 
 
 @dataclass(frozen=True, eq=False)
+class SceneState:
+    """A scene at one moment.
+
+    Attributes:
+        generation: see `SceneRecord`.
+        create_time_us: when it was created, microseconds since 1970; other scenes of its key have another.
+        read: reads its attributes from what is stored; DataLoss if they are damaged.
+    """
+
+    generation: int
+    create_time_us: int
+    read: Callable[[], SceneAttributes]
+
+    @cached_property
+    def attributes(self) -> SceneAttributes:
+        """Its attributes, with its self-calibrations; DataLoss if they are damaged."""
+        return self.read()
+
+
+@dataclass(frozen=True, eq=False)
 class SceneSnapshot:
-    """References and the generation of their scene, read at one moment, in the order requested.
+    """References and their scene, read at one moment; the references are in the order requested.
 
     Undescribed are those without features of the requested extractor.
     """
 
-    generation: int
+    scene: SceneState
     references: tuple[DescribedReference, ...]
     undescribed: tuple[ReferenceRecord, ...] = ()
+
+    @property
+    def generation(self) -> int:
+        """The scene's generation."""
+        return self.scene.generation
 
 
 @dataclass(frozen=True, eq=False, slots=True)

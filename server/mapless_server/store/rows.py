@@ -4,6 +4,7 @@ import hashlib
 import time
 import uuid
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
@@ -80,9 +81,10 @@ def self_calibration(row: Row[Any]) -> SelfCalibration | None:
         return None
 
 
-def self_calibrations(found: Sequence[Row[Any]]) -> tuple[SelfCalibration, ...]:
-    """Reads rows of that table, without damaged ones."""
-    return tuple(it for it in map(self_calibration, found) if it is not None)
+def answered_attributes(row: Row[Any], found: Sequence[Row[Any]]) -> SceneAttributes:
+    """As `scene_attributes`, with the self-calibrations of rows of `scene_calibration` that are not damaged."""
+    calibrations = tuple(it for it in map(self_calibration, found) if it is not None)
+    return replace(scene_attributes(row), self_calibrations=calibrations)
 
 
 def calibration_owner(scene_key: str, kind: str) -> str:

@@ -142,7 +142,7 @@ class Store(StoreReader):
         changes = {name: value for name, value in given.items() if value is not UNCHANGED}
         with self.changing() as connection:
             queries.begin_change(connection, scene_key)
-            stored, found = queries.find_attributes(connection, scene_key), NO_ATTRIBUTES
+            stored, found = queries.find_scene(connection, scene_key), NO_ATTRIBUTES
             try:
                 found = rows.scene_attributes(stored)
             except DataLoss:
@@ -170,7 +170,7 @@ class Store(StoreReader):
         # The keys are never used again; their entries would only take room until they are evicted.
         gone = self.reference_cache.forget(lambda _, it: it.record.scene_key == scene_key)
         self._resolved.forget(lambda key, _: key[0] == scene_key)
-        self._attributes.forget(lambda key, _: key == scene_key)
+        self._scenes.forget(lambda key, _: key == scene_key)
         try:
             self._pending_deletions.run()
         except Overloaded:

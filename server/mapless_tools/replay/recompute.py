@@ -39,7 +39,15 @@ from mapless_server.security import Principal, SceneKey, key_of
 from mapless_server.services.capture.calls import CapturedCall, CapturedPart, CaptureError, Response, diagnostics_of
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.watching import Watchers
-from mapless_server.store import DescribedReference, LruCache, ReferenceRecord, SceneAttributes, Store, codec
+from mapless_server.store import (
+    DescribedReference,
+    LruCache,
+    ReferenceRecord,
+    SceneAttributes,
+    SceneState,
+    Store,
+    codec,
+)
 
 Joined = TypeVar("Joined")
 
@@ -127,11 +135,12 @@ class RecordedSource:
         for index, reference_id in enumerate(reference_ids):
             if reference_id not in self.part.references:
                 raise DataLoss(f"reference {reference_id!r} was not captured", field=f"references[{index}]")
-        return self.part.generation, self.references.load(scene_key, reference_ids, extractor)
+        scene = SceneState(self.part.generation, 0, lambda: self.call.attributes)
+        return scene, self.references.load(scene_key, reference_ids, extractor)
 
-    def attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        """Implements ReferenceSource."""
-        return self.call.attributes
+    def contradiction(self, scene_key: SceneKey) -> str:
+        """Implements ReferenceSource: it is captured with the attributes."""
+        return ""
 
     def choose(
         self,

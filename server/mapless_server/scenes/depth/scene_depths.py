@@ -59,7 +59,7 @@ class DepthMaker:
         the scene was deleted, DataLoss if the reference is damaged, or any exception of the network.
         """
         context = StageContext(check)
-        _, (subject,) = library.load(scene_key, [reference_id], self._extractor, context)
+        scene, (subject,) = library.load(scene_key, [reference_id], self._extractor, context)
         neighbours = self._neighbours(scene_key, library, subject, reference_id, context)
         if len(neighbours) < 2:
             return {}
@@ -67,7 +67,7 @@ class DepthMaker:
         query, *others = neighbours
         given = [replace(it, world_from_camera=it.world_from_camera.shifted(-origin)) for it in (subject, *others)]
         correspondences = self._matcher.correspond(query.view, (subject, *others), Matching.STRICT, check)
-        is_metric = not library.attributes(scene_key).arbitrary_unit
+        is_metric = not scene.attributes.arbitrary_unit
         request = Request(query.view, given, correspondences, is_metric=is_metric)
         (outcome,) = self._network.reconstruct_many([request])
         check()

@@ -38,6 +38,7 @@ from .queries import (
     check_capture_time,
     enum_to_message,
     message_of,
+    needs_attributes,
     options_from_message,
     photo_from_message,
     priors_from_message,
@@ -98,6 +99,7 @@ def queries_from_message(
                 priors=priors,
                 is_part=True,
                 is_generic=request.options.ignore_calibration,
+                attributes=attributes if needs_attributes(message) else None,
             )
         )
     return tuple(queries)

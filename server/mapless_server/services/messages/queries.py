@@ -177,6 +177,7 @@ def query_from_message(
         rerank=request.options.rerank_references and bool(request.references),
         priors=priors,
         is_generic=request.options.ignore_calibration,
+        attributes=attributes if needs_attributes(request) else None,
     )
 
 
