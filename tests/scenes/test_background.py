@@ -224,7 +224,9 @@ class TestStrongPairs:
 
 
 class TestDamage:
-    def test_a_damaged_pair_is_deleted_and_made_again(self, store: Store, place: Folder) -> None:
+    def test_a_damaged_pair_is_deleted_and_made_again(
+        self, store: Store, place: Folder, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         server = Server(store, kinds=[Matching.STRICT])
         server.background.match_waiting()
         usual = server.stored()
@@ -238,10 +240,12 @@ class TestDamage:
         for pair, matches in Matcher().correspond(PLANTED.query, found.references()).reference_pairs.items():
             np.testing.assert_array_equal(correspondences.reference_pairs[pair], matches)
         left = len(usual) - found.counts.found["damaged"]
+        claims: list[str] = []
+        monkeypatch.setattr(found.background._pairs, "claim", lambda name, _: claims.append(name))
         found.background.start(makes_pairs=False)
         wait_until(lambda: place.fetch("SELECT count(*) FROM reference_pair") == [(left,)])
         found.background.close()
-        assert found.counts.made == 0
+        assert claims == []
         maker = Server(store, kinds=[Matching.STRICT])
         maker.background.match_waiting()
         assert maker.counts.made == found.counts.found["damaged"]
