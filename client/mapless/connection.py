@@ -157,12 +157,10 @@ class Connection:
         self, method: str, request: Any, read: Callable[[Any], Iterable[T]], timeout_s: float | None
     ) -> AsyncIterator[T]:
         """Yields the items of a list, which is fetched page by page when needed; `read` returns those of a page."""
-
-        def of_page(page: Any) -> tuple[list[T], str]:
-            return [*read(page)], page.next_page_token
-
         while True:
-            items, request.page_token = await self.call(method, request, of_page, timeout_s)
+            items, request.page_token = await self.call(
+                method, request, lambda page: ([*read(page)], page.next_page_token), timeout_s
+            )
             for item in items:
                 yield item
             if not request.page_token:

@@ -13,7 +13,7 @@ from typing import Any
 
 import grpc
 
-from mapless.errors import MaplessError, from_rpc_error
+from mapless.errors import from_rpc_error
 from mapless.proxies import is_exempt
 
 from .calls import CallRecord, Fate, Kind, PlannedCall
@@ -135,7 +135,8 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
     except grpc.aio.AioRpcError as error:
         ended_s = loop.time()
         known = from_rpc_error(error)
-        code, detail, retry_after_s = known.code, _reason(known), known.retry_after_s
+        is_given = known.request_id or known.reason != known.code  # by the server, with a reason
+        code, detail, retry_after_s = known.code, known.reason if is_given else "", known.retry_after_s
     except asyncio.CancelledError:
         if not call.cancelled() or hang_up is None:
             raise  # this task was cancelled, not the call
@@ -146,8 +147,3 @@ async def _call(target: Target, planned: PlannedCall, begin_s: float) -> CallRec
             hang_up.cancel()
     times_s = (planned.at_s, sent_s - begin_s, ended_s - begin_s)
     return CallRecord(planned.kind, planned.client, *times_s, deadline_s, code, detail, retry_after_s)
-
-
-def _reason(known: MaplessError) -> str:
-    """The reason that the server gave; empty if it gave none, or did not answer."""
-    return "" if known.reason == known.code and not known.request_id else known.reason

@@ -163,7 +163,9 @@ async def _measure(place: Place, server: LoadedServer, options: SoakOptions, pro
         before = [
             await closed_loop_step("unloaded", server.under_load, target, server.requests.good, 1, options.ramp_s)
         ]
-        p50_ms = before[0].account.answers.p50_ms or 1000.0
+        # Cancelled and hurried calls end before about half of the answers.
+        early_s = 2 * (before[0].account.answers.p50_ms or 1000.0) / 1000
+        mix = Mix(options.cancelled_share, options.bad_share, early_s, options.hurried_share, early_s)
         rate_per_s = options.rate_per_s
         if rate_per_s is None:
             ramp, saturation_per_s = await find_saturation(server, target, options.ramp_s, progress)
@@ -179,7 +181,7 @@ async def _measure(place: Place, server: LoadedServer, options: SoakOptions, pro
                 seconds,
                 settle_s=options.settle_share * seconds,
                 seed=options.seed,
-                mix=_mix(options, p50_ms),
+                mix=mix,
                 requests=mixed_requests(server.requests, place.queries),
                 beside=lambda: churning(workers, options.seed) if options.churn else nullcontext(),
             )
@@ -188,17 +190,6 @@ async def _measure(place: Place, server: LoadedServer, options: SoakOptions, pro
         account = reconcile([*step.codes, *workers.outcomes.localize_codes], step.scraped)
     slopes = slopes_of(found, options.settle_share * seconds)
     return SoakResult(place.title, options, before, rate_per_s, step, found, slopes, workers.outcomes, account)
-
-
-def _mix(options: SoakOptions, p50_ms: float) -> Mix:
-    """Cancelled and hurried calls end before about half of the answers."""
-    return Mix(
-        options.cancelled_share,
-        options.bad_share,
-        cancel_within_s=2 * p50_ms / 1000,
-        hurried_share=options.hurried_share,
-        hurry_s=2 * p50_ms / 1000,
-    )
 
 
 def _slope_check(field: str, found: Slope | None, is_bound: bool, options: SoakOptions) -> Check:

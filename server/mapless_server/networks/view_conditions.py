@@ -40,14 +40,9 @@ def pinhole_rays(intrinsics: Tensor, height_px: int, width_px: int) -> Tensor:
     """Unit rays (V, H, W, 3) of pinholes (V, 3, 3) in which (0, 0) is the centre of the top-left pixel; skew is 0."""
     columns = torch.arange(width_px, dtype=intrinsics.dtype, device=intrinsics.device)
     rows = torch.arange(height_px, dtype=intrinsics.dtype, device=intrinsics.device)
-    (fx, fy), (cx, cy) = (it[..., None, None].unbind(1) for it in _focal_and_principal(intrinsics))
+    (fx, _, cx), (_, fy, cy), _ = (row.unbind(-1) for row in intrinsics[..., None, None, :, :].unbind(-2))
     x, y = torch.broadcast_tensors((columns - cx) / fx, (rows[:, None] - cy) / fy)
     return F.normalize(torch.stack([x, y, torch.ones_like(x)], dim=-1), dim=-1)
-
-
-def _focal_and_principal(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
-    """Focal lengths and principal points, (V, 2) each, x and y."""
-    return intrinsics[:, :2, :2].diagonal(dim1=1, dim2=2), intrinsics[:, :2, 2]
 
 
 def quaternions_from_rotations(rotations: Tensor) -> Tensor:

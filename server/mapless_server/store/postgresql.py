@@ -83,8 +83,8 @@ class PostgresqlDatabase:
         except (DBAPIError, RequestError, ValueError) as error:
             database.close()
             fault = error if isinstance(error, DBAPIError) else error.__cause__
-            cause = fault.orig if isinstance(fault, DBAPIError) else fault or error
-            raise StoreError(f"database {database.name} cannot be used: {_first_line(cause)}") from None
+            cause = str(fault.orig if isinstance(fault, DBAPIError) else fault or error).partition("\n")[0].strip()
+            raise StoreError(f"database {database.name} cannot be used: {cause}") from None
         except BaseException:
             database.close()
             raise
@@ -196,10 +196,6 @@ def _create_engine(url: URL, cursors_are_binary: bool = True) -> Engine:
         connection.server_cursor_factory = server_cursor
 
     return engine
-
-
-def _first_line(error: object) -> str:
-    return str(error).partition("\n")[0].strip()
 
 
 def _translated(error: DBAPIError) -> RequestError | None:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from mapless import Camera, LocalizationResult, Reference, Rejected
 from mapless.diagnostics import Debug, Diagnostics
 from mapless.lenses import lens_model_of
+from mapless.names import reference_name
 from mapless_server.errors import InvalidArgument
 from mapless_tools.charts import figure_of, inline_svg, new_axes
 from mapless_tools.matches import MAX_GOOD, MAX_WRONG, Shot, axes_on, data_uri, draw_matches, rendered, side_by_side
@@ -60,7 +61,7 @@ def answer_page(
         down_in_world: direction of gravity in the scene; None to estimate it from the cameras.
         missing: a sentence on references that are left out.
     """
-    known = {_name(it): it for it in references}
+    known = {reference_name(it.scene_id, it.reference_id): it for it in references}
     text = str(answer)
     return render(
         "answer.html",
@@ -83,10 +84,6 @@ def best_references(answer: Answer) -> list[str]:
     hint = answer.hint if isinstance(answer, Rejected) else None
     hinted = [hint.best_reference] if hint is not None and hint.best_reference else []
     return list(dict.fromkeys([*hinted, *(use.name for use in order[:MAX_PAIRS])]))
-
-
-def _name(reference: Reference) -> str:
-    return f"scenes/{reference.scene_id}/references/{reference.reference_id}"
 
 
 def _shot(image: bytes | None, camera: Camera, max_side_px: int) -> Shot | None:

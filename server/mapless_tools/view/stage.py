@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mapless import Reference
 from mapless.answers import Rejected
 from mapless.geometry import Array
+from mapless.names import reference_name
 from mapless_tools.draw.page import answer_page, best_references
 from mapless_tools.matches import Picture, read_picture
 
@@ -60,7 +61,8 @@ class Stage:
         self._selected: _Shown | None = None
         self._points: dict[bytes, tuple[Array, NDArray[np.uint8]]] = {}
         self._cloud: Any = None
-        self._references = {it.reference_id: self._draw_reference(i, it) for i, it in self._pictured()}
+        pictured = [(int(i), scenery.references[i]) for i in scenery.pictured]
+        self._references = {it.reference_id: self._draw_reference(i, it) for i, it in pictured}
         self._dots = self._draw_others()
         self._panel(title)
 
@@ -131,7 +133,7 @@ class Stage:
             )
 
     def _page(self, query: Query) -> str:
-        known = {f"scenes/{it.scene_id}/references/{it.reference_id}": it for it in self._scenery.references}
+        known = {reference_name(it.scene_id, it.reference_id): it for it in self._scenery.references}
         used = {it.name for it in query.answer.diagnostics.references} & known.keys()
         pictured = best_references(query.answer)
         references = [
@@ -149,9 +151,6 @@ class Stage:
         with _dialogue(client, f"Reference {reference.reference_id}") as gui:
             gui.add_image(picture, format="jpeg", jpeg_quality=88)
             gui.add_markdown(details)
-
-    def _pictured(self) -> list[tuple[int, Reference]]:
-        return [(int(i), self._scenery.references[i]) for i in self._scenery.pictured]
 
     def _draw_reference(self, index: int, reference: Reference) -> Any:
         name, pose = f"/references/{index}", reference.world_from_camera

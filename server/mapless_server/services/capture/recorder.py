@@ -17,8 +17,6 @@ from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
-from google.protobuf.message import Message
-
 from mapless.names import parse_reference_name, parse_scene_name
 from mapless_server import __version__
 from mapless_server.engine.query import Query, Result, Tier
@@ -103,7 +101,7 @@ class Recorder:
         tenant = call.principal.tenant
         if self._tenants and tenant not in self._tenants:
             return
-        if reason := self._refusal(_size_bytes(request, response)):
+        if reason := self._refusal(request.ByteSize() + response.ByteSize()):
             self._drop(reason)
             return
         for diagnostics in diagnostics_of(response):
@@ -116,8 +114,8 @@ class Recorder:
             parse_scene_name(request.scene),
             attributes=parts[0][1].attributes,
             parts=tuple(captured_part(*part) for part in parts),
-            request=_serialized(request),
-            response=_serialized(response),
+            request=request.SerializeToString(),
+            response=response.SerializeToString(),
         )
         with self._changed:
             self._queue.append((captured, tiers))
@@ -210,14 +208,6 @@ def _version_of(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return ""
-
-
-def _size_bytes(*messages: Message) -> int:
-    return sum(it.ByteSize() for it in messages)
-
-
-def _serialized(message: Message) -> bytes:
-    return bytes(message.SerializeToString())
 
 
 def open_recorder(settings: Settings, metrics: Metrics) -> Recorder | None:
