@@ -38,13 +38,10 @@ def _with_setting_flags(command: Callable[..., None]) -> Callable[..., None]:
             default = default_text(name)
             values = "; ".join(filter(None, (bounds_text(name), default and f"default: {default}")))
             option = typer.Option(help=f"{field.description} ({values})" if values else field.description)
-            flags.append(_keyword(name, Annotated[kind | None, option]))
+            annotation = Annotated[kind | None, option]
+            flags.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation))
     vars(command)["__signature__"] = inspect.Signature([*own, *flags])
     return command
-
-
-def _keyword(name: str, annotation: Any) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
 
 
 @_with_setting_flags
