@@ -8,7 +8,7 @@ positions.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -41,7 +41,7 @@ COMPASS_SIGMA_DEG = 10.0
 """Standard deviation that the compass of a phone has in common to all photographs, near steel and electronics."""
 MAX_PITCH_SINE = 0.87
 """A camera that looks 60 degrees up or down has no direction of view."""
-SAMPLES = 400
+SAMPLES = 200
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -59,6 +59,26 @@ class Fixes:
     def accuracy_m(self) -> float:
         """The median of the stated horizontal accuracies."""
         return float(np.median(self.sigma_m))
+
+    @property
+    def are_one_place(self) -> bool:
+        """Whether most positions are as near to each other as those of cameras at one place."""
+        from_middle_m = np.linalg.norm(self.x_in_enu[:, :2], axis=1)
+        return bool(np.quantile(from_middle_m, 0.9) <= BOUND_SIGMAS * self.accuracy_m)
+
+    def of(self, chosen: Array) -> "Fixes":
+        """Those that are chosen."""
+        return replace(
+            self,
+            photographs=self.photographs[chosen],
+            x_in_enu=self.x_in_enu[chosen],
+            sigma_m=self.sigma_m[chosen],
+        )
+
+    def scattered(self, scatter_m: float) -> "Fixes":
+        """With standard deviations of this median; larger by what they have in common, as INDEPENDENT says."""
+        together = math.sqrt(max(1.0, len(self.sigma_m) / INDEPENDENT))
+        return replace(self, sigma_m=self.sigma_m * (together * scatter_m / self.accuracy_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,16 +142,17 @@ def fit_gps(part: Part, fixes: Fixes, down: Down | None, scale: ScaleEstimate | 
     best = _agreeing(centres, fixes, down)
     if best is None:
         return None
+    found, use = best
     for _ in range(2):
-        found, use = best
-        solved, jacobian = _solved(centres[use], fixes, use, found, down, scale)
-        use = _off(solved.apply(centres), fixes) <= BOUND_SIGMAS
+        found, _ = _solved(centres[use], fixes.of(use), found, down, scale)
+        use = _off(found.apply(centres), fixes) <= BOUND_SIGMAS
         if use.sum() < MIN_FIXES:
             return None
-        best = solved, use
-    solved, use = best
-    solved, jacobian = _solved(centres[use], fixes, use, solved, down, scale)
-    return _fit(solved, jacobian, centres, fixes, use)
+    across_m = np.linalg.norm((found.apply(centres) - fixes.x_in_enu)[use, :2], axis=1)
+    least_m = fixes.accuracy_m if fixes.has_accuracy else MIN_SCATTER_M
+    scatter_m = max(float(np.sqrt((across_m**2).mean())), least_m)
+    found, jacobian = _solved(centres[use], fixes.of(use).scattered(scatter_m), found, down, scale)
+    return _fit(found, jacobian, found.apply(centres)[use], scatter_m, tuple(fixes.photographs[~use].tolist()))
 
 
 def compass_turn(part: Part, enu_from_part: Similarity) -> tuple[float, float] | None:
@@ -203,10 +224,10 @@ def _off(x_in_enu: Array, fixes: Fixes) -> Array:
 
 
 def _solved(
-    centres: Array, fixes: Fixes, use: Array, start: Similarity, down: Down | None, scale: ScaleEstimate | None
+    centres: Array, fixes: Fixes, start: Similarity, down: Down | None, scale: ScaleEstimate | None
 ) -> tuple[Similarity, Array]:
     """The similarity of least weighted squares, and the Jacobian by log scale, rotation (3) and translation (3)."""
-    target, sigma_m = fixes.x_in_enu[use], fixes.sigma_m[use]
+    target, sigma_m = fixes.x_in_enu, fixes.sigma_m
     has_height = np.isfinite(target[:, 2])
     middle = centres.mean(axis=0)
     at_middle = start.apply(middle)
@@ -235,19 +256,11 @@ def _solved(
     return similarity(found.x), np.asarray(found.jac)
 
 
-def _fit(solved: Similarity, jacobian: Array, centres: Array, fixes: Fixes, use: Array) -> GpsFit:
-    x_in_enu = solved.apply(centres)
-    across_m = np.linalg.norm((x_in_enu - fixes.x_in_enu)[use, :2], axis=1)
-    residual_m = float(np.sqrt((across_m**2).mean()))
-    scatter_m = max(residual_m, fixes.accuracy_m if fixes.has_accuracy else MIN_SCATTER_M)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * max(1.0, use.sum() / INDEPENDENT)
-    covariance *= max(1.0, float(np.median(residual_m / fixes.sigma_m[use]))) ** 2
-    sigmas = np.sqrt(np.diag(covariance))
-    moved = x_in_enu[use]
-    extent_m = max(float(np.linalg.norm(moved - it, axis=1).max()) for it in moved)
-    false = tuple(fixes.photographs[~use].tolist())
+def _fit(found: Similarity, jacobian: Array, x_in_enu: Array, scatter_m: float, false: tuple[int, ...]) -> GpsFit:
+    sigmas = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
+    extent_m = max(float(np.linalg.norm(x_in_enu - it, axis=1).max()) for it in x_in_enu)
     heading_deg, tilt_deg = math.degrees(sigmas[3]), math.degrees(sigmas[1:3].max())
-    return GpsFit(solved, float(sigmas[0]), heading_deg, tilt_deg, scatter_m, extent_m, int(use.sum()), false)
+    return GpsFit(found, float(sigmas[0]), heading_deg, tilt_deg, scatter_m, extent_m, len(x_in_enu), false)
 
 
 def names_of(part: Part, photographs: Sequence[int]) -> str:

@@ -190,7 +190,9 @@ def _with_earth(part: Part, known: _Known, said: _Said) -> _Known:
     if fixes is None:
         return known
     fit = fit_gps(part, fixes, known.down)
-    if fit is None and len(fixes.photographs) >= MIN_FIXES:
+    if fit is None and fixes.are_one_place:
+        said.notes.append("GPS gives no unit: its positions are those of one place, to their accuracy")
+    elif fit is None and len(fixes.photographs) >= MIN_FIXES:
         said.warnings.append(f"GPS of {len(fixes.photographs)} photographs does not agree with their poses: not used")
         return known
     if fit is not None:
