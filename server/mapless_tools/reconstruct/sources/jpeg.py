@@ -1,0 +1,15 @@
+"""Writes pictures that are decoded, of a video or a HEIC file, as JPEG files."""
+
+from pathlib import Path
+
+from PIL import Image
+
+from mapless_tools.output_files import whole_file
+
+QUALITY = 95
+
+
+def write_jpeg(file: Path, picture: Image.Image, *, exif: bytes = b"", icc_profile: bytes | None = None) -> None:
+    """Writes a picture as JPEG of quality 95: the whole file or none."""
+    with whole_file(file) as partial:
+        picture.save(partial, "JPEG", quality=QUALITY, exif=exif, icc_profile=icc_profile)
