@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, TypeVar, cast
 
 from mapless.v1 import localization_service_pb2 as pb
@@ -43,7 +44,6 @@ from mapless_server.store import (
     DescribedReference,
     LruCache,
     ReferenceRecord,
-    SceneAttributes,
     SceneState,
     Store,
     codec,
@@ -201,17 +201,10 @@ def recompute(
     references.check(call)
     request = MESSAGES[call.method][0].FromString(call.request)
     engine = cast(QueueEngine, _Recomputing(call, request, then, references, tiers, options))
-    service = LocalizationService(lambda: engine, Metrics(), cast(Store, _Attributes(call)), Watchers(False))
+    store = cast(Store, SimpleNamespace(get_attributes=lambda _: call.attributes))
+    service = LocalizationService(lambda: engine, Metrics(), store, Watchers(False))
     now = Call(call.request_id, time.monotonic(), math.inf, Principal(tenant=call.tenant))
     return cast(Response, asyncio.run(getattr(service, call.method)(request, now)))
-
-
-class _Attributes:
-    def __init__(self, call: CapturedCall) -> None:
-        self._attributes = call.attributes
-
-    def get_attributes(self, scene_key: SceneKey) -> SceneAttributes:
-        return self._attributes
 
 
 class _Recomputing:
