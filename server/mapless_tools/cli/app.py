@@ -15,6 +15,7 @@ from mapless_tools.draw.command import draw_command
 from mapless_tools.evaluate.cli import evaluate_command
 from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
+from mapless_tools.reconstruct.command import reconstruct_command
 from mapless_tools.replay.command import replay_bag_command, replay_command
 from mapless_tools.view.command import view_command
 
@@ -80,6 +81,7 @@ app.add_typer(token_app, name="token")
 app.add_typer(weights_app, name="weights")
 _add_tool("import", import_command, cls=ImportCommand)
 _add_tool("export", export_command)
+_add_tool("reconstruct", reconstruct_command, extra="reconstruct")
 _add_tool("audit", audit_command)
 _add_tool("draw", draw_command)
 _add_tool("evaluate", evaluate_command)

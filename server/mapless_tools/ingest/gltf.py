@@ -60,7 +60,7 @@ def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) ->
         except InvalidArgument:
             return View(reference)
         points = _points(client, scene, reference, image) if next(left, None) is not None else (None, None)
-        return View(reference, _thumbnail(image), *points)
+        return View(reference, thumbnail(image), *points)
 
     views, damaged = fetch_all(client, scene, take, progress, PICTURES)
     if views:
@@ -70,7 +70,8 @@ def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) ->
     return Export(len(views), damaged)
 
 
-def _thumbnail(image: NDArray[np.uint8]) -> bytes:
+def thumbnail(image: NDArray[np.uint8]) -> bytes:
+    """A small photograph (JPEG) of one (H, W, 3) BGR."""
     scale = THUMBNAIL_PX / max(image.shape[:2])
     size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
     return bytes(cv2.imencode(".jpg", cv2.resize(image, size, interpolation=cv2.INTER_AREA))[1])

@@ -1,0 +1,57 @@
+"""The flags of `mapless-server reconstruct`. Imports modules when it runs, so that --help is quick."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def reconstruct_command(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE... OUT",
+            help="Videos, photographs and folders of photographs; then the folder to write.",
+            show_default=False,
+        ),
+    ],
+    frames: Annotated[int, typer.Option(help="Frames of all videos together, at most.")] = 150,
+    lens: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="fisheye|FILE",
+            help="fisheye: all lenses are. FILE: the intrinsics of a calibrated camera (JSON), used as they are for "
+            "photographs of its size. May be repeated.",
+        ),
+    ] = None,
+    part: Annotated[int, typer.Option(help="Which part to write, if the photographs show several places.")] = 1,
+    features: Annotated[str, typer.Option(help="Local features, as the setting of the server names them.")] = "auto",
+) -> None:
+    """Compute the poses of videos and photographs that have none, and write them to a folder that can be imported.
+
+    Run it again to go on where it was interrupted. The folder gets photographs, cameras.json, report.html and
+    scene.glb, all of them or none.
+    """
+    import pycolmap
+
+    from mapless_server.serve.signals import terminable
+    from mapless_tools.progress import progress_bars
+    from mapless_tools.usage import failures_end_command
+
+    from .cameras import LensOptions
+    from .output import REPORT, printed, write_folder
+    from .run import ReconstructOptions, prepare, read_photographs, reconstruct
+
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    with failures_end_command(ValueError, interrupted="interrupted; run it again to go on"):
+        *sources, out = paths
+        options = ReconstructOptions(part=part, features=features, lens=LensOptions.of(lens or ()))
+        with terminable(), progress_bars() as progress:
+            work = prepare(sources, out)
+            pictures = read_photographs(sources)
+            result = reconstruct(pictures, work, options, progress)
+            write_folder(result, work, out, progress)
+    print("\n".join(printed(result)))
+    print(f"they are in {out}; look at {out / REPORT}, then: mapless-server import {out} SCENE")

@@ -1,0 +1,172 @@
+"""Cameras, poses and points from matches, by pycolmap's mappers, and which photographs they leave out and why."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import pycolmap
+
+from mapless.geometry import Array, RigidTransform
+from mapless_tools.progress import Progress
+
+from .cameras import from_colmap
+from .features import FeatureFolder
+from .matching import SEED
+from .pictures import Omitted, Part, Picture, PosedPicture
+
+FEWEST = 3
+"""Photographs of a part: with two nothing confirms their poses."""
+PARALLAX_DEG = 1.5
+"""Least angle at a point between two photographs, for half of the points: below, distances are not determined."""
+FEWEST_MATCHES = 15
+"""Matches of two photographs that agree; pycolmap's."""
+_NO_PARALLAX = frozenset(
+    int(it)
+    for it in (
+        pycolmap.TwoViewGeometryConfiguration.PANORAMIC,
+        pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
+    )
+)
+Result = TypeVar("Result")
+
+
+def map_photographs(database: Path, folder: Path, count: int, threads: int, progress: Progress) -> None:
+    """Writes pycolmap's models of a database into a folder: 0, 1, ...; none if no photographs fit together."""
+    options = pycolmap.IncrementalPipelineOptions(
+        min_model_size=FEWEST, extract_colors=False, num_threads=threads, random_seed=SEED
+    )
+    token = pycolmap.CancellationToken()
+    registered = 0
+
+    def add() -> None:
+        nonlocal registered
+        registered = min(registered + 1, count)
+        progress("poses", registered, count)
+
+    progress("poses", 0, count)
+    folder.mkdir()
+    _interruptible(
+        lambda: pycolmap.incremental_mapping(
+            database, database.parent, folder, options, next_image_callback=add, cancellation_token=token
+        ),
+        token.cancel,
+    )
+    progress("poses", count, count)
+
+
+def _interruptible(work: Callable[[], Result], cancel: Callable[[], None]) -> Result:
+    """The result of native code, which would not be interrupted by Ctrl-C."""
+    results: list[Result] = []
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            results.append(work())
+        except BaseException as failure:
+            failures.append(failure)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive():
+            thread.join(0.1)
+    except BaseException:
+        cancel()
+        raise
+    if failures:
+        raise failures[0]
+    return results[0]
+
+
+def read_parts(folder: Path, pictures: Sequence[Picture], features: FeatureFolder) -> tuple[Part, ...]:
+    """The models of a folder that have parallax, the one with most photographs first."""
+    by_name = {it.name: it for it in pictures}
+    models = [pycolmap.Reconstruction(str(it)) for it in sorted(folder.iterdir(), key=lambda it: int(it.name))]
+    parts = [_part(it, by_name, features) for it in models if _parallax_deg(it) >= PARALLAX_DEG]
+    return tuple(sorted(parts, key=lambda it: -len(it.posed)))
+
+
+def why_no_part(database: Path, folder: Path) -> str:
+    """A sentence that says why no photographs of a database, with the models of a folder, got poses."""
+    with pycolmap.Database.open(database) as content:
+        verified = [it for it in content.read_two_view_geometries()[1] if len(it.inlier_matches) >= FEWEST_MATCHES]
+    if not verified:
+        return (
+            "no two photographs show the same place clearly enough to be compared: take photographs that overlap by "
+            "more than half, sharp and lit"
+        )
+    turned = sum(int(it.config) in _NO_PARALLAX for it in verified)
+    if any(folder.iterdir()) or turned > len(verified) / 2:
+        return (
+            "the camera seems only to have turned: photographs differ as those from one place do, so that nothing "
+            "shows how far it moved, or all show one flat surface; move the camera by a step between photographs"
+        )
+    return (
+        "too few photographs fit together for poses: at least three must show the same place from different positions"
+    )
+
+
+def omitted(part: Part, parts: Sequence[Part], pictures: Sequence[Picture], database: Path) -> tuple[Omitted, ...]:
+    """The photographs that have no pose in a part, each with the reason."""
+    found = {it.picture.name for it in part.posed}
+    images = {number: picture.name for number, picture in enumerate(pictures, 1)}
+    shared = dict.fromkeys(images.values(), 0)
+    with pycolmap.Database.open(database) as content:
+        pairs, counts = content.read_two_view_geometry_num_inliers()
+    for pair, count in zip(pairs, counts, strict=True):
+        first, second = (images[it] for it in pycolmap.pair_id_to_image_pair(pair))
+        for one, other in ((first, second), (second, first)):
+            if other in found:
+                shared[one] = max(shared[one], count)
+    of_other = {it.picture.name: f"it is in part {i}" for i, other in enumerate(parts, 1) for it in other.posed}
+    return tuple(
+        Omitted(name, of_other.get(name) or _reason(shared[name])) for name in images.values() if name not in found
+    )
+
+
+def _reason(matches: int) -> str:
+    if matches < FEWEST_MATCHES:
+        return f"too few matches: no photograph with a pose shares {FEWEST_MATCHES} that agree"
+    return f"it shares {matches} matches with a photograph that has a pose, too few of them with points"
+
+
+def _part(model: pycolmap.Reconstruction, by_name: Mapping[str, Picture], features: FeatureFolder) -> Part:
+    points = list(model.points3D.values())
+    posed = []
+    for image in sorted(model.images.values(), key=lambda it: it.image_id):
+        if image.has_pose:
+            camera_from_world = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+            pose = RigidTransform.from_matrix(camera_from_world).inverse()
+            camera = from_colmap(model.cameras[image.camera_id])
+            posed.append(PosedPicture(by_name[image.name], camera, pose, image.num_points3D))
+    x_in_world = np.array([it.xyz for it in points]).reshape(-1, 3)
+    return Part(tuple(posed), x_in_world, _colours(model, points, features), model.compute_mean_reprojection_error())
+
+
+def _colours(model: pycolmap.Reconstruction, points: Sequence[pycolmap.Point3D], features: FeatureFolder) -> Array:
+    """Mean colours (N, 3) of the keypoints of each point."""
+    sums, counts = np.zeros((len(points), 3)), np.zeros(len(points))
+    seen: dict[int, list[tuple[int, int]]] = {}
+    for row, point in enumerate(points):
+        for element in point.track.elements:
+            seen.setdefault(element.image_id, []).append((row, element.point2D_idx))
+    for image_id, pairs in seen.items():
+        rows, keypoints = np.array(pairs).T
+        np.add.at(sums, rows, features.colours(model.images[image_id].name)[keypoints])
+        np.add.at(counts, rows, 1)
+    return np.asarray(sums / np.maximum(counts, 1)[:, None])
+
+
+def _parallax_deg(model: pycolmap.Reconstruction) -> float:
+    """The median over points of the largest angle between two photographs that see it; 0 without points."""
+    centres = {it.image_id: it.projection_center() for it in model.images.values() if it.has_pose}
+    angles = []
+    for point in model.points3D.values():
+        rays = np.array([centres[it.image_id] for it in point.track.elements]) - point.xyz
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        angles.append(float((rays @ rays.T).min()))
+    return float(np.degrees(np.arccos(np.clip(np.median(angles), -1, 1)))) if angles else 0.0

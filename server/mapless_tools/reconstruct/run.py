@@ -1,0 +1,177 @@
+"""The order of the steps, from videos and photographs to a folder of photographs with poses.
+
+Each step keeps its result in `OUT/.work`, under a name made of what it depends on, so that a run that was interrupted
+continues, and one with another unit or part computes only what differs. The folder gets its files when all are made.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from mapless_server.choices import AUTO
+from mapless_server.images import ANY_SIZE, image_size
+from mapless_server.images.exif import read_exif
+from mapless_server.method.features.matching import OPTIONS, fastest_arithmetic
+from mapless_server.scenes.retrieval.vlad import VladDescriptor
+from mapless_server.serve.assembly import make_first_features
+from mapless_server.settings import available_cores, load_settings
+from mapless_tools.dataset import IMAGE_ENDINGS, legal_id
+from mapless_tools.progress import Progress
+
+from .cameras import LensOptions, StartingCamera, starting_cameras
+from .features import FeatureFolder
+from .mapping import FEWEST, map_photographs, omitted, read_parts, why_no_part
+from .matching import MatchFolder, PairOptions, pairs_of, verify, write_database
+from .pictures import Omitted, Part, Picture, Pictures, WorldFrame
+
+WORK = ".work"
+
+
+@dataclass(frozen=True)
+class ReconstructOptions:
+    """Options of a reconstruction.
+
+    Attributes:
+        part: which part is written, from 1 on, the largest first.
+        features: the local features, as the setting of the server names them.
+    """
+
+    part: int = 1
+    features: str = AUTO
+    lens: LensOptions = field(default_factory=LensOptions)
+    pairs: PairOptions = field(default_factory=PairOptions)
+
+    def __post_init__(self) -> None:
+        if self.part < 1:
+            raise ValueError(f"part must be at least 1, is {self.part}")
+
+
+@dataclass(frozen=True)
+class Reconstructed:
+    """A reconstruction: the part that was chosen, in its world, and what is said of it.
+
+    `parts` are the numbers of photographs of all parts; `omitted` are those without a pose in this one.
+    """
+
+    part: Part
+    world: WorldFrame
+    cameras: tuple[StartingCamera, ...]
+    parts: tuple[int, ...]
+    omitted: tuple[Omitted, ...]
+    notes: tuple[str, ...]
+
+
+def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, progress: Progress) -> Reconstructed:
+    """Computes poses; ValueError says why there are none."""
+    chosen = pictures.chosen
+    if len(chosen) < FEWEST:
+        raise ValueError(
+            f"{len(chosen)} photographs are too few: with fewer than {FEWEST} nothing confirms their poses; take ten "
+            "or more, each showing half of what the one before shows"
+        )
+    cameras = starting_cameras(chosen, options.lens)
+    features, database = _compared(chosen, cameras, work, options, progress)
+    models = database.with_name(f"models-{database.name}")
+    with made_once(models) as made:
+        if made is not None:
+            map_photographs(database, made, len(chosen), available_cores(), progress)
+    parts = read_parts(models, chosen, features)
+    if not parts:
+        raise ValueError(why_no_part(database, models))
+    if options.part > len(parts):
+        raise ValueError(f"there is no part {options.part}: the photographs give {len(parts)}")
+    part = parts[options.part - 1]
+    left_out = (*pictures.omitted, *omitted(part, parts, chosen, database))
+    placed, world = _placed(part)
+    return Reconstructed(placed, world, cameras, tuple(len(it.posed) for it in parts), left_out, pictures.notes)
+
+
+def _compared(
+    pictures: Sequence[Picture],
+    cameras: Sequence[StartingCamera],
+    work: Path,
+    options: ReconstructOptions,
+    progress: Progress,
+) -> tuple[FeatureFolder, Path]:
+    """The photographs' features, and the database of their matches and of the geometry of each pair."""
+    kind, extractor = make_first_features(load_settings({"features": options.features}).settings)
+    features = FeatureFolder(work / "features", extractor, pictures)
+    features.extract(progress)
+    names = [it.name for it in pictures]
+    pairs = pairs_of(names, features, VladDescriptor.of(extractor), options.pairs, progress)
+    files = [features.file(it.name).stem for it in pictures]
+    ratio = OPTIONS[kind].query_ratio
+    key = _digest(files, names, pairs, ratio)
+    matches = MatchFolder(work / f"matches-{key}", features, ratio, fastest_arithmetic())
+    matches.match(pairs, progress)
+    database = work / f"database-{_digest(key, [repr(it) for it in cameras])}"
+    with made_once(database) as made:
+        if made is not None:
+            write_database(made, cameras, names, features, matches)
+            progress("verification", 0, 1)
+            verify(made, available_cores())
+            progress("verification", 1, 1)
+    return features, database
+
+
+@contextmanager
+def made_once(result: Path) -> Iterator[Path | None]:
+    """A file or folder to make, which gets its name when the block ends without an error; None if it is there."""
+    if result.exists():
+        yield None
+        return
+    partial = result.with_name(f".{result.name}.partial")
+    remove(partial)
+    yield partial
+    partial.replace(result)
+
+
+def remove(path: Path) -> None:
+    """Removes a file or a folder, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _digest(*values: object) -> str:
+    return hashlib.sha256(json.dumps(values).encode()).hexdigest()[:16]
+
+
+def prepare(sources: Sequence[Path], out: Path) -> Path:
+    """Makes the folder and the one for the steps' results in it; ValueError if it is not ours to write."""
+    if not sources:
+        raise ValueError("name a source, a video or a folder of photographs, before the folder to write")
+    for source in sources:
+        if not source.exists():
+            raise ValueError(f"{source} is not there")
+    work = out / WORK
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"{out} is not a folder: the folder to write comes last")
+    if out.exists() and not work.is_dir() and any(out.iterdir()):
+        raise ValueError(f"{out} is not empty, and not from an earlier run: name a folder that is not there")
+    work.mkdir(parents=True, exist_ok=True)
+    return work
+
+
+def read_photographs(sources: Sequence[Path]) -> Pictures:
+    """The photographs of folders."""
+    files = [it for source in sources for it in (sorted(source.iterdir()) if source.is_dir() else [source])]
+    chosen: dict[str, Picture] = {}
+    for file in files:
+        if file.suffix.lower() in IMAGE_ENDINGS:
+            data = file.read_bytes()
+            name = legal_id(file.stem, chosen)
+            chosen[name] = Picture(name, file, *image_size(data, ANY_SIZE), file, read_exif(data))
+    return Pictures(tuple(chosen.values()))
+
+
+def _placed(part: Part) -> tuple[Part, WorldFrame]:
+    return part, WorldFrame(False, math.inf, None, ())
