@@ -34,8 +34,6 @@ def reconstruct_command(
     Run it again to go on where it was interrupted. The folder gets photographs, cameras.json, report.html and
     scene.glb, all of them or none.
     """
-    import pycolmap
-
     from mapless_server.serve.signals import terminable
     from mapless_tools.progress import progress_bars
     from mapless_tools.usage import failures_end_command
@@ -44,7 +42,6 @@ def reconstruct_command(
     from .output import REPORT, printed, write_folder
     from .run import ReconstructOptions, prepare, read_photographs, reconstruct
 
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     with failures_end_command(ValueError, interrupted="interrupted; run it again to go on"):
         *sources, out = paths
         options = ReconstructOptions(part=part, features=features, lens=LensOptions.of(lens or ()))

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera
-from mapless_server.images import ANY_SIZE, decode_image
+from mapless_server.images import ANY_SIZE, decode_image, upright_of
 from mapless_server.method.features.extractors import FeatureExtractor
-from mapless_server.method.features.extractors.turned import extract_turned
+from mapless_server.method.features.extractors.turned import extract_upright
 from mapless_server.method.features.views import Features, View
 from mapless_server.settings import available_cores
 from mapless_tools.output_files import whole_file
@@ -22,8 +22,6 @@ from mapless_tools.progress import Progress, tracked
 
 from .pictures import Picture
 
-CLOCKWISE_DEG = {3: 180.0, 4: 180.0, 5: 90.0, 6: 90.0, 7: 270.0, 8: 270.0}
-"""By EXIF's orientation, how far the raster is turned to be upright; mirrored ones, which no camera writes, too."""
 VIEWS_IN_MEMORY = 64
 
 
@@ -70,14 +68,11 @@ class FeatureFolder:
         return View(_plain_camera(width, height), features)
 
     def _extract(self, picture: Picture) -> None:
-        image = decode_image(picture.path.read_bytes(), ANY_SIZE)
+        data = picture.path.read_bytes()
+        image = decode_image(data, ANY_SIZE)
         height, width = image.shape[:2]
         camera = _plain_camera(width, height)
-        degrees = CLOCKWISE_DEG.get(picture.orientation)
-        if degrees is None:
-            view = self._extractor.extract(image, camera)
-        else:
-            view = extract_turned(self._extractor, image, camera, (degrees,))
+        view = extract_upright(self._extractor, image, camera, upright_of(data).clockwise_deg)
         share = np.divide((width, height), (view.camera.width_px, view.camera.height_px))
         pixels = (view.features.pixels() + 0.5) * share - 0.5
         column, row = np.rint(pixels).astype(int).T
@@ -103,6 +98,4 @@ def _plain_camera(width: int, height: int) -> Camera:
 
 
 def _digest(picture: Picture, extractor: str) -> str:
-    content = hashlib.sha256(picture.path.read_bytes())
-    content.update(f"{picture.orientation} {extractor}".encode())
-    return content.hexdigest()[:32]
+    return hashlib.sha256(picture.path.read_bytes() + extractor.encode()).hexdigest()[:32]

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import pycolmap
+
 from mapless_server.choices import AUTO
 from mapless_server.images import ANY_SIZE, image_size
 from mapless_server.images.exif import read_exif
@@ -70,6 +72,7 @@ class Reconstructed:
 
 def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, progress: Progress) -> Reconstructed:
     """Computes poses; ValueError says why there are none."""
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     chosen = pictures.chosen
     if len(chosen) < FEWEST:
         raise ValueError(

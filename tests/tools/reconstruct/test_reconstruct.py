@@ -1,0 +1,113 @@
+"""Photographs without poses get the poses that are known of them, or a sentence that says why not."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.images import encode, textured
+
+from mapless.geometry import Array
+from mapless_tools.demo.photographs import Photograph, room
+from mapless_tools.ingest.formats.cameras import read_folder
+from mapless_tools.ingest.metres import umeyama
+from mapless_tools.reconstruct.output import write_folder
+from mapless_tools.reconstruct.run import (
+    Reconstructed,
+    ReconstructOptions,
+    prepare,
+    read_photographs,
+    reconstruct,
+)
+
+OPTIONS = ReconstructOptions(features="sift")
+
+
+def silent(step: str, done: int, total: int) -> None:
+    pass
+
+
+def photographs(folder: Path, chosen: Sequence[Photograph]) -> Path:
+    folder.mkdir()
+    for it in chosen:
+        (folder / f"{it.name}.jpg").write_bytes(it.data)
+    return folder
+
+
+def reconstructed(source: Path, out: Path, options: ReconstructOptions = OPTIONS) -> Reconstructed:
+    return reconstruct(read_photographs([source]), prepare([source], out), options, silent)
+
+
+def errors(result: Reconstructed, truth: Sequence[Photograph]) -> Array:
+    """Errors (N,) of positions after alignment, metres."""
+    true = {it.name: it.world_from_camera.translation for it in truth}
+    found = np.stack([it.world_from_camera.translation for it in result.part.posed])
+    wanted = np.stack([true[it.picture.name] for it in result.part.posed])
+    return np.asarray(np.linalg.norm(umeyama(found, wanted).apply(found) - wanted, axis=1))
+
+
+@pytest.fixture(scope="module")
+def chosen() -> Sequence[Photograph]:
+    return room().references[:7]
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory, chosen: Sequence[Photograph]) -> Path:
+    return photographs(tmp_path_factory.mktemp("room") / "photos", chosen)
+
+
+@pytest.fixture(scope="module")
+def out(source: Path) -> Path:
+    return source.parent / "out"
+
+
+@pytest.fixture(scope="module")
+def result(source: Path, out: Path) -> Reconstructed:
+    return reconstructed(source, out)
+
+
+def test_poses_are_those_of_the_rendered_room(result: Reconstructed, chosen: Sequence[Photograph]) -> None:
+    assert len(result.part.posed) == len(chosen)
+    assert not result.omitted
+    assert np.median(errors(result, chosen)) < 0.02
+    assert [it.camera.focal_x_px for it in result.part.posed] == pytest.approx([816] * len(chosen), rel=0.03)
+
+
+def test_folder_is_read_as_posed_photographs(result: Reconstructed, out: Path, chosen: Sequence[Photograph]) -> None:
+    write_folder(result, out / ".work", out, silent)
+    frames = {it.name: it for it in read_folder(out).frames}
+    for given in chosen:
+        assert frames[given.name].image_path.read_bytes() == given.data
+    assert (out / "report.html").read_text().count("reference-0") >= len(chosen)
+    assert (out / "scene.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_turning_camera_gets_no_poses(tmp_path: Path) -> None:
+    chosen = room().references[0]
+    image = cv2.imdecode(np.frombuffer(chosen.data, np.uint8), cv2.IMREAD_COLOR)
+    matrix = chosen.camera.matrix()
+    turned = []
+    for degrees in range(-12, 13, 4):
+        turn = cv2.Rodrigues(np.radians([degrees / 3, degrees, 0.0]))[0]
+        part = cv2.warpPerspective(image, matrix @ turn @ np.linalg.inv(matrix), (960, 720))
+        data = encode(".jpg", part[150:570, 200:760])
+        turned.append(Photograph(f"turned{degrees}", data, chosen.camera, chosen.world_from_camera))
+    with pytest.raises(ValueError, match="only to have turned"):
+        reconstructed(photographs(tmp_path / "photos", turned), tmp_path / "out")
+
+
+def test_photographs_of_nothing_common_are_refused(tmp_path: Path, chosen: Sequence[Photograph]) -> None:
+    apart = [
+        Photograph(f"{i}", encode(".jpg", textured(320, 240, seed=i)), it.camera, it.world_from_camera)
+        for i, it in enumerate(chosen[:3])
+    ]
+    with pytest.raises(ValueError, match="no two photographs show the same place"):
+        reconstructed(photographs(tmp_path / "photos", apart), tmp_path / "out")
+
+
+def test_folder_of_others_is_not_written_to(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("mine")
+    with pytest.raises(ValueError, match="not empty"):
+        prepare([tmp_path], tmp_path)
+    assert [it.name for it in tmp_path.iterdir()] == ["letter.txt"]
