@@ -17,6 +17,8 @@ from dataclasses import replace
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
+from google.protobuf.message import Message
+
 from mapless.names import parse_reference_name, parse_scene_name
 from mapless_server import __version__
 from mapless_server.engine.query import Query, Result, Tier
@@ -101,7 +103,8 @@ class Recorder:
         tenant = call.principal.tenant
         if self._tenants and tenant not in self._tenants:
             return
-        if reason := self._refusal(request.ByteSize() + response.ByteSize()):
+        messages: tuple[Message, Message] = request, response
+        if reason := self._refusal(sum(it.ByteSize() for it in messages)):
             self._drop(reason)
             return
         for diagnostics in diagnostics_of(response):
@@ -114,8 +117,8 @@ class Recorder:
             parse_scene_name(request.scene),
             attributes=parts[0][1].attributes,
             parts=tuple(captured_part(*part) for part in parts),
-            request=request.SerializeToString(),
-            response=response.SerializeToString(),
+            request=messages[0].SerializeToString(),
+            response=messages[1].SerializeToString(),
         )
         with self._changed:
             self._queue.append((captured, tiers))
