@@ -14,10 +14,11 @@ from support.tags import looking, part_of, posed_without_file
 from mapless.geodesy import Datum, geodetic_from_world, world_from_geodetic
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.images.exif import Exif, GpsPosition
-from mapless_tools.ingest.metres import KnownDistance
+from mapless_tools.ingest.command import DISTANCE_SEPARATOR
 from mapless_tools.reconstruct.pictures import Part, WorldFrame
-from mapless_tools.reconstruct.world import place, world_options
+from mapless_tools.reconstruct.world import WorldFlags
 from mapless_tools.reconstruct.world.down import DOWN_OF_ORIENTATION
+from mapless_tools.reconstruct.world.placing import place
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 PLACE = Datum(47.37, 8.54, 410.0)
@@ -66,7 +67,12 @@ def gps(truth: Sequence[RigidTransform], noise_m: float, accuracy_m: float | Non
 
 
 def placed(part: Part, **flags: Any) -> tuple[Part, WorldFrame]:
-    return place(part, world_options(**flags), lambda *_: None)
+    return place(part, WorldFlags(**flags).options(), lambda *_: None)
+
+
+def distance(first: str, second: str, metres: float) -> str:
+    """The values of the flag, as the command joins them."""
+    return DISTANCE_SEPARATOR.join((first, second, repr(metres)))
 
 
 def centres(part: Part) -> Array:
@@ -111,7 +117,7 @@ def test_points_move_with_the_cameras() -> None:
     truth = poses()
     points = np.random.default_rng(0).normal(size=(20, 3))
     part = part_of(part_with(truth).posed, points)
-    found, _ = placed(part, distances=[KnownDistance("r0", "r12", 6.0)])
+    found, _ = placed(part, distance=[distance("r0", "r12", 6.0)])
     for it, pose in zip(found.posed, truth, strict=True):
         seen = CAMERA.project(it.world_from_camera.inverse().apply(found.points_in_world))
         np.testing.assert_allclose(seen, CAMERA.project(pose.inverse().apply(points)), atol=1e-6)
@@ -120,17 +126,17 @@ def test_points_move_with_the_cameras() -> None:
 def test_distances_give_the_unit_and_contradictions_are_refused() -> None:
     truth = poses()
 
-    def known(first: int, second: int, factor: float = 1.0) -> KnownDistance:
+    def known(first: int, second: int, factor: float = 1.0) -> str:
         metres = float(np.linalg.norm(truth[first].translation - truth[second].translation))
-        return KnownDistance(f"r{first}", f"r{second}.jpg", factor * metres)
+        return distance(f"r{first}", f"r{second}.jpg", factor * metres)
 
-    part, frame = placed(part_with(truth), distances=[known(0, 12, 1.005), known(3, 9)])
+    part, frame = placed(part_with(truth), distance=[known(0, 12, 1.005), known(3, 9)])
     assert size_ratio(part, truth) == pytest.approx(1, abs=0.005)
     assert 0.002 < frame.scale_sigma < 0.02
     with pytest.raises(ValueError, match="contradict each other"):
-        placed(part_with(truth), distances=[known(0, 12), known(3, 9, 1.3)])
+        placed(part_with(truth), distance=[known(0, 12), known(3, 9, 1.3)])
     with pytest.raises(ValueError, match="no reference 'r99'"):
-        placed(part_with(truth), distances=[KnownDistance("r0", "r99", 1.0)])
+        placed(part_with(truth), distance=[distance("r0", "r99", 1.0)])
 
 
 def test_positions_of_some_photographs_give_unit_frame_and_up(tmp_path: Path) -> None:
@@ -144,7 +150,7 @@ def test_positions_of_some_photographs_give_unit_frame_and_up(tmp_path: Path) ->
     assert abs(size_ratio(part, truth) - 1) < 3 * frame.scale_sigma
     assert "known.csv: 1 of 9 positions are of other photographs" in frame.notes
     with pytest.raises(ValueError, match=r"contradicts itself.*by distances: .*; known\.csv: "):
-        placed(part_with(truth), positions=file, distances=[KnownDistance("r0", "r12", 7.0)])
+        placed(part_with(truth), positions=file, distance=[distance("r0", "r12", 7.0)])
 
 
 def test_poses_of_arkit_give_metres_and_gravity(tmp_path: Path) -> None:
@@ -286,7 +292,7 @@ def test_compass_and_a_distance_give_a_room_its_datum() -> None:
         for it, pose in zip(gps(truth, 3.0, 5.0), truth, strict=True)
     ]
     metres = float(np.linalg.norm(truth[0].translation - truth[12].translation))
-    flags = {"distances": [KnownDistance("r0", "r12", metres)]}
+    flags = {"distance": [distance("r0", "r12", metres)]}
     part, frame = placed(part_with(truth, exif), **flags)
     assert frame.is_metric
     assert frame.datum is not None
@@ -301,7 +307,7 @@ def test_compass_and_a_distance_give_a_room_its_datum() -> None:
 def test_gps_that_contradicts_a_distance_is_named() -> None:
     way = street()
     metres = 1.3 * float(np.linalg.norm(way[0].translation - way[20].translation))
-    part, frame = placed(part_with(way, gps(way, 0.5)), distances=[KnownDistance("r0", "r20", metres)])
+    part, frame = placed(part_with(way, gps(way, 0.5)), distance=[distance("r0", "r20", metres)])
     assert size_ratio(part, way) == pytest.approx(1.3, abs=0.01)
     assert "GPS contradicts the unit" in "\n".join(frame.warnings)
 
@@ -333,8 +339,10 @@ def test_gps_can_be_left_out() -> None:
         ({"positions": Path("a"), "tag": ["36h11:0=1"], "origin": "36h11:0"}, "one of --origin and --positions"),
         ({"positions": Path("a"), "positions_up": "up"}, "positions_up must be one of x, y, z"),
         ({"positions_up": "y"}, "positions, which are not given"),
+        ({"distance": [distance("a", "b", 0.0)]}, "--distance a b 0.0: .* must be above 0 m"),
+        ({"distance": ["a\0b\0two"]}, "--distance a b two: metres must be numbers"),
     ],
 )
 def test_flags_that_do_not_fit_together_are_named(flags: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        world_options(**flags)
+        WorldFlags(**flags).options()

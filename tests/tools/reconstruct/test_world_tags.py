@@ -15,8 +15,9 @@ from mapless_tools.dataset import Frame
 from mapless_tools.demo.photographs import ROOM
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.reconstruct.pictures import Part, WorldFrame
-from mapless_tools.reconstruct.world import place, world_options
+from mapless_tools.reconstruct.world import WorldFlags
 from mapless_tools.reconstruct.world.options import FAMILIES
+from mapless_tools.reconstruct.world.placing import place
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
 APRIL, ARUCO = cv2.aruco.DICT_APRILTAG_36h11, cv2.aruco.DICT_4X4_50
@@ -34,7 +35,7 @@ def walk(count: int = 5) -> list[RigidTransform]:
 
 
 def placed(part: Part, *tags: str, origin: str = "") -> tuple[Part, WorldFrame]:
-    return place(part, world_options(tag=tags, origin=origin), lambda *_: None)
+    return place(part, WorldFlags(tag=[*tags], origin=origin).options(), lambda *_: None)
 
 
 def length_ratio(part: Part, truth: Sequence[RigidTransform]) -> float:
@@ -205,7 +206,7 @@ def test_a_camera_that_only_turns_gives_no_unit(tmp_path: Path) -> None:
 )
 def test_wrong_flags_are_named(tags: list[str], origin: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        world_options(tag=tags, origin=origin)
+        WorldFlags(tag=tags, origin=origin).options()
 
 
 def test_families_are_those_of_opencv() -> None:

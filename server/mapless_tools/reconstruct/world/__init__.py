@@ -1,10 +1,10 @@
 """The world of a reconstruction: its unit of length, origin and way up, by what is known of them.
 
 May import `reconstruct.pictures`, the server's rooms, and the layouts and fits of `ingest`. Begin with `placing.place`,
-then `tags` and `squares`, `gps`, `down`.
+then `tags` and `squares`, `gps`, `down`; `flags` are those of commands.
 """
 
-from .options import WorldOptions, world_options
-from .placing import place
+from .flags import WorldFlags
+from .options import WorldOptions
 
-__all__ = ["WorldOptions", "place", "world_options"]
+__all__ = ["WorldFlags", "WorldOptions"]

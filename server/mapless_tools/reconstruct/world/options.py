@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -104,24 +103,3 @@ def parse_sized_tag(text: str) -> SizedTag:
     except ValueError:
         raise ValueError(f"tag {text!r}: must be FAMILY:NUMBER=METRES; {_EXAMPLE}") from None
     return SizedTag(parse_tag(tag), edge_m)
-
-
-def world_options(
-    tag: Sequence[str] = (),
-    origin: str = "",
-    distances: Sequence[KnownDistance] = (),
-    positions: Path | None = None,
-    positions_up: str = "",
-    gravity: Path | None = None,
-    gps: bool = True,
-) -> WorldOptions:
-    """The options of the flags' texts; ValueError names the flag and what is wrong."""
-    return WorldOptions(
-        tuple(map(parse_sized_tag, tag)),
-        parse_tag(origin) if origin else None,
-        tuple(distances),
-        positions,
-        positions_up,
-        gravity,
-        gps,
-    )
