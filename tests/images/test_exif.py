@@ -88,10 +88,10 @@ def of(gps: dict[str, Any], **tags: Any) -> bytes:
 
 
 def test_south_west_below_the_sea_is_negative() -> None:
-    gps = {"GPSLatitude": (33.0, 30.0, 36.0), "GPSLatitudeRef": "S", "GPSLongitude": (70.0, 0.0, 0.0)}
+    gps: dict[str, Any] = {"GPSLatitude": (33.0, 30.0, 36.0), "GPSLatitudeRef": "S", "GPSLongitude": (70.0, 0.0, 0.0)}
     gps |= {"GPSLongitudeRef": "W", "GPSAltitude": 12.5, "GPSAltitudeRef": b"\x01", "GPSHPositioningError": 4.5}
     found = read_exif(of(gps)).position
-    assert found == GpsPosition(pytest.approx(-33.51), -70.0, -12.5, 4.5)
+    assert found == GpsPosition(-(33 + 30 / 60 + 36 / 3600), -70.0, -12.5, 4.5)
 
 
 @pytest.mark.parametrize("latitude", [(0.0, 0.0, 0.0), (91.0, 0.0, 0.0), (IFDRational(0, 0), 0.0, 0.0), (1.0, 2.0)])

@@ -12,7 +12,7 @@ from mapless.geometry import rotation_from_vector
 from mapless_tools.output_files import write_json
 from research.contradictions.cases import quarter_turn
 from research.doubt.cases import doubtful, write_list
-from research.doubt.tables import by, by_angle
+from research.doubt.tables import by, by_turn
 from research.evidence.turning import turned, turned_pixels
 from research.other_places import crossed
 from research.places import Scenes, own_and_other
@@ -130,7 +130,7 @@ def turned_row(photograph: str, angle_deg: int, outcome: str, processor_s: float
 def test_turned_photographs_are_compared_with_themselves_upright() -> None:
     rows = [turned_row("a", 0, "right", 0.5), turned_row("b", 0, "LOW_OVERLAP", 9.0), turned_row("c", 0, "right", 1.0)]
     rows += [turned_row("a", 90, "right", 1.0), turned_row("b", 90, "right", 1.0), turned_row("c", 90, "wrong", 4.0)]
-    assert by_angle(rows)[2:] == [
+    assert by_turn(rows, "angle_deg")[2:] == [
         "| 0 | 2 | 2 (100 %) | 0 | 0 | 0.75 | 0.97 | 1.00 | 1.00 |",
         "| 90 | 2 | 1 (50 %) | 1 | 0 | 2.50 | 3.85 | 3.00 | 3.33 |",
     ]

@@ -27,7 +27,7 @@ def upgrade() -> None:
     image = sa.table("image", sa.column("reference_key"), sa.column("data"))
     keys = connection.scalars(sa.select(image.c.reference_key)).all()
     for key in keys:
-        data = connection.scalar(sa.select(image.c.data).where(image.c.reference_key == key))
+        (data,) = connection.execute(sa.select(image.c.data).where(image.c.reference_key == key)).one()
         if upright_of(bytes(data)) == Upright():
             continue
         for name, column in _DERIVED:
