@@ -92,7 +92,7 @@ class Known:
 
     def chance_of_place(self, options: PromiseOptions = PROMISE) -> float:
         """The chance that the photograph shows what two references show."""
-        return 1 / (1 + math.exp(min(50.0, (options.agreement - self.agreement) / options.spread)))
+        return (1 + math.tanh((self.agreement - options.agreement) / options.spread / 2)) / 2
 
     def chance_wrong(self, options: PromiseOptions = PROMISE) -> float:
         """The chance that the accepted pose is wrong."""

@@ -20,6 +20,7 @@ from mapless.geometry import Array, RigidTransform
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..structure.model import PointMatches, Structure
 from .priors import IntrinsicsSigma, PriorCheck
+from .significance import HEAVY_TAIL
 
 if TYPE_CHECKING:  # services do not load what computes
     from .intrinsics import IntrinsicsEvidence
@@ -162,7 +163,7 @@ def observers(structure: Structure, points: NDArray[np.intp]) -> NDArray[np.intp
     return structure.tracks.view[is_chosen[structure.tracks.point]]
 
 
-TAIL_95 = 1.47
+TAIL_95 = HEAVY_TAIL
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Evidence: radii."""
 
 SELF_TAIL_95 = 1.3

@@ -8,7 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from PIL import Image
 from mapless.geometry import Array, Camera
 from mapless_server.networks.encoder import PATCH_PX
 
-from ..features.views import Ignored, undistort_pixels
+from ..features.views import ALONG_SIDE, Ignored, undistort_pixels
 
 PIXEL_LIMIT = 37 * 28 * PATCH_PX**2
 """Largest number of pixels of a picture: 518x392 for 4:3, a fifth fewer patches than the official loader's 574x434, and
@@ -64,7 +64,7 @@ class Grid:
         return self.columns / self.rows
 
 
-@lru_cache(maxsize=8)
+@cache
 def _grids(pixel_limit: int) -> tuple[Grid, ...]:
     """One grid for each aspect."""
     return tuple(fitted_grid(width, height, pixel_limit) for width, height in ASPECTS)
@@ -116,7 +116,7 @@ def ideal_camera(camera: Camera, pixel_limit: int) -> Camera:
 def _distortion_matters(camera: Camera, pixel_limit: int) -> bool:
     if camera.distortion is None:
         return False
-    columns, rows = (np.linspace(-0.5, side - 0.5, 17) for side in (camera.width_px, camera.height_px))
+    columns, rows = (np.linspace(-0.5, side - 0.5, ALONG_SIDE) for side in (camera.width_px, camera.height_px))
     rays = camera.rays(np.stack(np.meshgrid(columns, rows), axis=-1))
     moved_px = np.linalg.norm(camera.project(rays) - camera.pinhole().project(rays), axis=-1)
     scale = math.sqrt(pixel_limit / (camera.width_px * camera.height_px))

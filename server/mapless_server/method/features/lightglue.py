@@ -43,6 +43,8 @@ CONFIDENCES = 0.95, 0.99
 """The authors' depth and width confidence, see `LightGlue.match_one`, with which it takes half the time."""
 
 CPU_OPTIONS = LightGlueOptions(max_keypoints=MAX_KEYPOINTS // 2, pairs_at_once=1)
+"""On a CPU, where time is quadratic in the keypoints; pairs together take no less than one after the other."""
+
 CUDA_OPTIONS = LightGlueOptions(half=True)
 
 

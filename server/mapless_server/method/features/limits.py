@@ -1,5 +1,8 @@
 """Limits that hold wherever keypoints are found, matched and explained; pixels are those of the processed image."""
 
+MULTIPLE_PX = 32
+"""Sides of the images that networks take are multiples of it, so none is shorter."""
+
 MAX_SIDE_PX = 1024
 """Longer images are reduced to this side before features are found; networks were trained and published with it."""
 

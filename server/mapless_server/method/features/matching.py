@@ -122,8 +122,9 @@ def has_exact_products() -> bool:
     """Whether sums of torch's products of int8 do not saturate on this processor. Imports torch."""
     import torch
 
-    largest = torch.full((_ROWS_AT_ONCE, 64), 127, dtype=torch.int8)
-    return bool((torch._int_mm(largest, largest.T) == 64 * 127**2).all())
+    most = torch.iinfo(torch.int8).max
+    largest = torch.full((_ROWS_AT_ONCE, 64), most, dtype=torch.int8)
+    return bool((torch._int_mm(largest, largest.T) == largest.shape[1] * most**2).all())
 
 
 def best_of_both(
@@ -217,8 +218,10 @@ _ALIKED = CorrespondOptions(
     wide_similarity=0.6,
     guided_similarity=0.65,
 )
+"""Options of ALIKED's features."""
 
 _EDGEPOINT2 = replace(_ALIKED, wide_similarity=0.84, guided_similarity=0.86)
+"""Options of EdgePoint2's and XFeat's features, whose cosines are larger."""
 
 OPTIONS: Mapping[str, CorrespondOptions] = {
     "sift": CorrespondOptions(),

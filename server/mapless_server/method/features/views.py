@@ -90,10 +90,10 @@ class Features:
 
 
 def rounded_descriptors(descriptors: NDArray[np.floating]) -> NDArray[np.int8]:
-    """Rounds descriptors (N, D) to 8 bits: each is scaled so that its largest number becomes 127."""
+    """Rounds descriptors (N, D) to 8 bits: each is scaled so that its largest number is the largest of them."""
     finite = np.nan_to_num(descriptors)
     largest = np.abs(finite).max(axis=1, keepdims=True, initial=np.finfo(np.float32).tiny)
-    return np.asarray(np.rint(finite * (127 / largest.astype(np.float64))), np.int8)
+    return np.asarray(np.rint(finite * (np.iinfo(np.int8).max / largest.astype(np.float64))), np.int8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,6 +308,9 @@ def reduce_image(
 MAX_INCIDENCE_DEG = 80.0
 """Rays further from the optical axis are dropped: a pinhole's pixels run to infinity towards 90 degrees."""
 
+ALONG_SIDE = 17
+"""Positions along a side of an image at which a lens is sampled."""
+
 MAX_ITERATIONS = 50
 """Largest number of iterations of the undistortion."""
 
@@ -356,7 +359,7 @@ def seen_share(camera: Camera) -> float:
     """Share of the image, 0 to 1, whose pixels have a ray through the lens; small for wrong coefficients."""
     if camera.distortion is None:
         return 1.0
-    across, down = (np.linspace(-0.5, side - 0.5, 17)[1::2] for side in (camera.width_px, camera.height_px))
+    across, down = (np.linspace(-0.5, side - 0.5, ALONG_SIDE)[1::2] for side in (camera.width_px, camera.height_px))
     pixels = np.stack(np.meshgrid(across, down), -1).reshape(-1, 2)
     return float(np.isfinite(undistort_pixels(pixels, camera)).all(axis=1).mean())
 

@@ -27,6 +27,7 @@ from ..features.views import Matches, PosedView, View
 from ..optim.optimize import LEAST_DAMPING, cauchy_weight, pose_jacobian
 from ..pose.pnp import PnpOptions, ransac
 from ..pose.two_view_matches import TwoViewMatches
+from ..pose.with_priors import MIN_INLIERS
 from ..structure.model import PixelPoints, PointMatches, Structure
 
 MOST_POINTS = 2000
@@ -150,7 +151,7 @@ def _median_disagreement(
         seen = seen[rows]
     shifts = _shifts_nearby(seen, halves, pose, distance_m)
     for half, shift in zip(halves, shifts, strict=True):
-        if np.isnan(shift[0]) and half.sum() >= 4:
+        if np.isnan(shift[0]) and half.sum() >= MIN_INLIERS:
             found = ransac(seen[half], None, PNP)
             shift[:] = np.nan if found is None else found.translation - pose.translation
     apart = np.linalg.norm(shifts[::2] - shifts[1::2], axis=1) / distance_m
@@ -260,7 +261,7 @@ def evidence_of(support: PosedSupport, votes: Votes) -> Evidence:
     """
     query, structure, matches = support.query, support.structure, support.matches
     inliers, pose = support.estimate.inliers, support.estimate.world_from_camera
-    if inliers.sum() < 4:
+    if inliers.sum() < MIN_INLIERS:
         raise ValueError("support.estimate must have at least 4 inliers")
     distance_m = support.distance_m()
     return Evidence(

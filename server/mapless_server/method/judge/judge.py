@@ -37,7 +37,7 @@ from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance, 
 from ..features.limits import INEXACT_INLIER_PX
 from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.one_reference import Found
-from ..pose.pnp import MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
+from ..pose.pnp import LN_10, MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .cameras import wrong_camera, wrong_intrinsics
 from .evidence import MAJORITY, Evidence, Votes, evidence_of, votes_of
@@ -63,8 +63,9 @@ MAX_RADIUS_SHARE = 0.08
 """Largest 68 % radius of the position, as a share of the distance to what the photograph shows: of the poses with a
 larger one too many are wrong. Evidence: largest-radius."""
 
-_RARE = (0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075)
-LEVELS = (*_RARE, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+LEVELS = (
+    0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0,
+)  # fmt: skip
 """Shares of the right answers at which `JudgeOptions.scores` are the quantiles."""
 
 ONE_REFERENCE_SCORES = (
@@ -158,7 +159,7 @@ def contradiction(
 
 def trust_of(evidence: Evidence, options: JudgeOptions, log10_chance: float = 0.0) -> float:
     """Trust: the share of right answers with at most this score; agreement with priors raises the score."""
-    agreement = -AGREEMENT_WEIGHT * math.log(10) * log10_chance
+    agreement = -AGREEMENT_WEIGHT * LN_10 * log10_chance
     return float(np.interp(evidence.score + agreement, options.scores, LEVELS))
 
 

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bundle.estimate import PosedSupport, Support
+from ..bundle.estimate import SUPPORTING_SHARE, PosedSupport, Support
 from ..features.tracks import keypoint_offsets
 from ..features.views import PosedView, ReferenceErrors, View
 from ..pairs.agreement import MAX_ERROR_PX
@@ -23,8 +23,8 @@ from ..pairs.stationary import StationaryOptions, have_same_shape, in_columns, s
 from ..pose.pnp import gate_failure
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 
-MIN_SHARE, MIN_INLIERS = 0.1, 6
-"""Inliers of a reference that a pose rests on: as a share of those of the reference with the most, and in all."""
+MIN_INLIERS = 6
+"""Inliers of a reference that a pose rests on, at least; and `SUPPORTING_SHARE` of those of the one with the most."""
 
 MOST_REFERENCES = 5
 """Those with the most inliers are compared: ten pairs."""
@@ -48,7 +48,7 @@ class Supporters:
         """Errors of the pairs of those that a pose rests on most, as far as they are known."""
         if self.error_px is None:
             return []
-        least = max(MIN_INLIERS, MIN_SHARE * max(self.inlier_counts, default=0))
+        least = max(MIN_INLIERS, SUPPORTING_SHARE * max(self.inlier_counts, default=0))
         used = [i for i, count in enumerate(self.inlier_counts) if count >= least]
         used = sorted(used, key=lambda i: -self.inlier_counts[i])[:MOST_REFERENCES]
         found = (self.error_px(*sorted(pair)) for pair in combinations(used, 2))

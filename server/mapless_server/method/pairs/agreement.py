@@ -25,6 +25,7 @@ AMBIGUOUS_SHARE = 0.25
 """Matches that satisfy the poses, as a share of those that contradict them, from which the pair says nothing."""
 
 _MOST_MATCHES = 150
+"""Matches from which the error of a pair is computed, at most."""
 
 LARGEST_ERROR_PX = float(MAX_SIDE_PX)
 """The error of a pair whose points lie behind its cameras."""

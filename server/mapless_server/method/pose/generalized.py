@@ -26,6 +26,9 @@ from ..structure.model import PixelPoints
 from .pnp import REFINEMENT, PnpOptions, inverse_of, iterations_between, poselib_camera, poselib_pose
 from .with_priors import samples_needed
 
+SAMPLE = 4
+"""Matches that determine a pose and the unit of the frame."""
+
 _libc = ctypes.CDLL(None)
 _rand_lock = threading.Lock()
 
@@ -95,13 +98,13 @@ def scaled_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> Simi
     )
     points = np.concatenate([camera.seen.x_in_world for camera in cameras])
     owner = np.repeat(np.arange(len(cameras)), [len(camera) for camera in cameras])
-    if len(points) < 4 or len(np.unique(owner)) < 2:
+    if len(points) < SAMPLE or len(np.unique(owner)) < 2:
         return None
-    random, best, best_count, needed = np.random.default_rng(0), None, 3, math.inf
+    random, best, best_count, needed = np.random.default_rng(0), None, SAMPLE - 1, math.inf
     for iteration in range(options.max_iterations):
         if iteration >= needed:
             break
-        sample = random.choice(len(points), 4, replace=False)
+        sample = random.choice(len(points), SAMPLE, replace=False)
         if len(np.unique(owner[sample])) < 2:
             continue
         with _repeatable():
@@ -111,7 +114,8 @@ def scaled_ransac(cameras: Sequence[CameraMatches], options: PnpOptions) -> Simi
             count = inlier_count(cameras, world_from_rig, options.inlier_px) if world_from_rig else 0
             if count > best_count:
                 best, best_count = world_from_rig, count
-                needed = samples_needed((count / len(points)) ** 4 / 2)  # half of all samples are of a single camera
+                # Half of all samples are of a single camera.
+                needed = samples_needed((count / len(points)) ** SAMPLE / 2)
     return best
 
 

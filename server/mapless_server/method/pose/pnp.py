@@ -7,6 +7,7 @@ The gate: a pose must have more inliers than wrong matches can be expected to gi
 and Stival 2004). Wrong matches of repeated texture agree with one another and pass it; `judge` rejects these.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,9 @@ from .with_priors import MIN_INLIERS, informed_pose
 SAMPLE, SAMPLE_INLIERS, SAMPLE_ITERATIONS = 80, 32, 300
 """Matches that RANSAC sees first, the least inliers among them, and the largest number of iterations: so many find a
 pose with that share of inliers, but for one case in 10^8."""
+
+LN_10 = math.log(10)
+"""From logarithms to base 10 to natural ones."""
 
 MIN_MATCHES = 6
 """Fewer give no pose."""
@@ -259,13 +263,13 @@ def false_alarms(match_count: int, inlier_count: int, chance: float, sample: int
     n, k, m = match_count, inlier_count, sample
     if k <= m or chance >= 1:
         return np.inf
-    return float((np.log(n - m) + _log_choose(n, k) + _log_choose(k, m) + (k - m) * np.log(chance)) / np.log(10))
+    return float((np.log(n - m) + _log_choose(n, k) + _log_choose(k, m) + (k - m) * np.log(chance)) / LN_10)
 
 
 def log10_tail(match_count: int, inlier_count: int, chance: float) -> float:
     """log10 of an upper bound of the probability of k or more inliers of n wrong matches, (n + 1) C(n, k) p^k."""
     n, k = match_count, inlier_count
-    return float(min(0.0, (np.log(n + 1) + _log_choose(n, k) + k * np.log(chance)) / np.log(10)))
+    return float(min(0.0, (np.log(n + 1) + _log_choose(n, k) + k * np.log(chance)) / LN_10))
 
 
 def format_false_alarms(log10_expected: float, log10_allowed: float) -> str:

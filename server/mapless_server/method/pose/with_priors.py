@@ -36,23 +36,20 @@ from ..optim.optimize import (
 )
 from ..structure.model import PixelPoints
 
-LOSS_SCALE_PX = 1.4
+LOSS_SCALE_PX = AdjustOptions.loss_scale_sigma
 """Scale c of the Cauchy loss; a right match has a standard deviation of one pixel."""
 
 PRIOR_WEIGHT = AdjustOptions.error_inflation**2
 """The factor w by which the matches have less information than if their errors were independent."""
 
 STEPS = MinimizeOptions(iterations=10, min_decrease=1e-4)
+"""Steps of a refinement with priors."""
 
 MIN_INLIERS = 4
 """Fewer inliers give no pose: any three agree with one."""
 
 ENOUGH_INLIERS = 50
 """With so many no candidates from priors are tried: more than repeated structure gives a wrong pose."""
-
-MIN_KEPT_SHARE = 0.8
-"""A refinement without priors that keeps a smaller share of the inliers has diverged; priors are then compared with the
-pose before it."""
 
 WEAK_INFORMATION = np.diag([1e-6] * 3 + [1e-2] * 3)
 """Information of an unknown pose: within kilometres, of any orientation."""
@@ -118,10 +115,14 @@ def informed_pose(
 
 
 def _with_priors(seen: PixelPoints, pose: RigidTransform, priors: Priors, inlier_px: float) -> InformedPose:
-    """Checks the priors and refines a pose, which has `MIN_INLIERS` inliers or more, with the consistent ones."""
+    """Checks the priors and refines a pose, which has `MIN_INLIERS` inliers or more, with the consistent ones.
+
+    A refinement without priors that keeps a small share of the inliers has diverged; priors are then compared with the
+    pose before it.
+    """
     alone = refine_pose(seen, pose, NO_PRIORS)
     before, after = (seen.inlier_count(it, inlier_px) for it in (pose, alone))
-    if after < max(MIN_INLIERS, MIN_KEPT_SHARE * before):
+    if after < max(MIN_INLIERS, AdjustOptions.min_kept_share * before):
         alone = pose
     # The inverse covariance of the pose error if the matches' errors were independent.
     information = _Problem(seen, alone, NO_PRIORS, LOSS_SCALE_PX).linearize(alone)[1]

@@ -14,6 +14,7 @@ from torch.nn.functional import conv2d, embedding_bag, grid_sample, normalize
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_aliked
 
+from ..limits import MULTIPLE_PX
 from ..masks import are_usable, usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
 from .network import LearnedOptions, array_of, image_tensor
@@ -22,6 +23,7 @@ _CORNERS = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
 """Pixels around a position, x and y, from the first."""
 
 _UNLIMITED = 2**31
+"""More keypoints than any image has."""
 
 _AT_ONCE = 256
 """Keypoints that are described at once, with 20 MB."""
@@ -120,7 +122,7 @@ def find_maps(network: ALIKED, image: torch.Tensor) -> Maps:
     That holds the features of all pixels, 580 MiB at 640x480. Here they are computed where a descriptor needs them: the
     first layer of the scores weighs the channels alone, so it may precede the interpolation.
     """
-    padder = InputPadder(image.shape[-2], image.shape[-1], 32)
+    padder = InputPadder(image.shape[-2], image.shape[-1], MULTIPLE_PX)
     x1 = network.block1(padder.pad(image).contiguous(memory_format=torch.channels_last))
     x2 = network.block2(network.pool2(x1))
     x3 = _residual(network.block3, network.pool4(x2))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapless_server.bounds import check_bounds
 
-from ..limits import MAX_KEYPOINTS, MAX_SIDE_PX
+from ..limits import MAX_KEYPOINTS, MAX_SIDE_PX, MULTIPLE_PX
 
 WINDOW_PX = 5
 """Side of the window in which a keypoint is the strongest pixel."""
@@ -31,7 +31,7 @@ class LearnedOptions:
 
     def __post_init__(self) -> None:
         check_bounds(self, "max_keypoints", at_least=1)
-        check_bounds(self, "max_side_px", at_least=32)
+        check_bounds(self, "max_side_px", at_least=MULTIPLE_PX)
         check_bounds(self, "min_score", at_least=0, below=1)
 
     def label(self, extractor: str, weights_sha256: str) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Camera
 from mapless_server.bounds import check_bounds
 
-from ..limits import MAX_KEYPOINTS, MAX_SIDE_PX
+from ..limits import MAX_KEYPOINTS, MAX_SIDE_PX, MULTIPLE_PX
 from ..masks import are_usable, usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
 
@@ -31,7 +31,7 @@ class SiftOptions:
 
     def __post_init__(self) -> None:
         check_bounds(self, "max_keypoints", at_least=1)
-        check_bounds(self, "max_side_px", at_least=32)
+        check_bounds(self, "max_side_px", at_least=MULTIPLE_PX)
         check_bounds(self, "contrast_threshold", at_least=0)
 
 

@@ -11,12 +11,10 @@ from torch.nn.functional import log_softmax, normalize, pixel_shuffle
 from mapless.geometry import Camera
 from mapless_server.networks.local_features import load_xfeat
 
+from ..limits import MULTIPLE_PX
 from ..masks import usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
 from .network import WINDOW_PX, LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
-
-MULTIPLE_PX = 32
-"""Sides of the images that the network takes."""
 
 SHIFT_PX = 0.4
 """From a maximum of the keypoint map to the image point, right and down, pixels: the positions that the weights were

@@ -39,8 +39,11 @@ middle, as a share of its extent or, if that is more, of the distance between pa
 MAX_ROTATION_SIGMA = math.radians(1.0)
 """The same of its rotation, radians."""
 STEPS = MinimizeOptions(30, 1e-6)
+"""Steps of the refinement."""
 _DIFFERENCE = 1e-6
-_INFLATION = 3.0  # errors of matches of a pair, and of poses of a session, are not independent
+"""Change of a parameter by which derivatives are taken."""
+_INFLATION = 3.0
+"""Factor on standard deviations: errors of matches of a pair, and of poses of a session, are not independent."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 PoseCorrection = Callable[[RigidTransform], RigidTransform]
 
-USUAL, RARE, STRANGE = 0, 1, 2
+USUAL, RARE, STRANGE = range(3)
 """How common a mistake is: of those that explain a scene equally well, only the most common are named."""
 
 

@@ -87,6 +87,7 @@ def _differ(cameras: Sequence[Camera], difference_px: Callable[[Camera], float])
 
 
 _QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""A quarter turn about the optical axis."""
 
 
 def turned(quarters: int) -> Callable[[PosedView], PosedView]:

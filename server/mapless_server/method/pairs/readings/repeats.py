@@ -25,6 +25,11 @@ EXACT_DIGITS = 8
 """Digits after the point to which numbers of a pose are equal but for rounding."""
 
 
+def decimal(digits: int) -> float:
+    """The unit of the last of so many digits after the point."""
+    return 10.0**-digits
+
+
 def same_poses(poses: Mapping[int, RigidTransform]) -> list[tuple[int, ...]]:
     """Groups of two and more photographs with exactly the same pose."""
     groups: dict[tuple[float, ...], list[int]] = {}
@@ -36,7 +41,7 @@ def same_poses(poses: Mapping[int, RigidTransform]) -> list[tuple[int, ...]]:
 
 def is_start(pose: RigidTransform) -> bool:
     """Whether a pose is the identity, as that of a tracker that has not begun; possibly in a format's other axes."""
-    axes, least = np.abs(pose.rotation), 10.0**-EXACT_DIGITS
+    axes, least = np.abs(pose.rotation), decimal(EXACT_DIGITS)
     return bool(np.abs(pose.translation).max() < least and np.abs(axes - np.round(axes)).max() < least)
 
 

@@ -14,7 +14,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 
 from ...features.views import PosedView
 from .errors import FEW_SHARE, PairSample, summary
-from .repeats import EXACT_DIGITS
+from .repeats import EXACT_DIGITS, decimal
 
 MIN_POSES = 4
 """Fewer poses may have round numbers by chance."""
@@ -43,7 +43,7 @@ def _step(values: Array) -> float:
     if np.ptp(values) == 0:
         return 0.0
     for digits in DIGITS:
-        step = 10.0**-digits
+        step = decimal(digits)
         multiples = values / step
         if (np.abs(multiples - np.round(multiples)) <= np.maximum(1e-6, 1e-15 * np.abs(multiples) * 4)).all():
             return step if digits < DIGITS[-1] else 0.0
@@ -56,14 +56,14 @@ def _rotation_step(poses: Sequence[RigidTransform]) -> float:
     for digits in range(1, MOST_ROTATION_DIGITS + 1):
         rounded = [_is_of_rounded_matrix(pose, digits) or _is_of_rounded_quaternion(pose, digits) for pose in poses]
         if np.mean(rounded) >= FEW_SHARE:  # a rounded matrix is not always nearest to the rotation made of it
-            return 10.0**-digits
+            return decimal(digits)
     return 0.0
 
 
 def _is_of_rounded_matrix(pose: RigidTransform, digits: int) -> bool:
     rounded = np.round(pose.rotation, digits)
     u, _, vt = np.linalg.svd(rounded)
-    return bool(np.abs(u @ vt - pose.rotation).max() < 10.0**-EXACT_DIGITS)
+    return bool(np.abs(u @ vt - pose.rotation).max() < decimal(EXACT_DIGITS))
 
 
 def _is_of_rounded_quaternion(pose: RigidTransform, digits: int) -> bool:
@@ -71,7 +71,7 @@ def _is_of_rounded_quaternion(pose: RigidTransform, digits: int) -> bool:
     numbers = np.array([q.x, q.y, q.z, q.w])
     rounded = np.round(numbers, digits)
     length = float(np.linalg.norm(rounded))
-    return length > 0 and bool(np.abs(rounded / length - numbers).max() < 10.0**-EXACT_DIGITS)
+    return length > 0 and bool(np.abs(rounded / length - numbers).max() < decimal(EXACT_DIGITS))
 
 
 def rounding_text(sample: PairSample, given_px: float) -> str:
