@@ -95,7 +95,7 @@ class Server:
         self.library = ReferenceLibrary(store)
         indexes = SceneIndexes(store, self.library, DESCRIPTOR, EXTRACTOR, 2**30)
         matchings = {TierMatching(EXTRACTOR, self.matcher, kind): self.finder for kind in kinds}
-        self.background = BackgroundMatching(store, indexes, matchings, is_idle, self.counts, options)
+        self.background = BackgroundMatching(store, indexes, matchings, is_idle, self.counts, options=options)
 
     def references(self) -> tuple[PosedView, ...]:
         ids = self.store.list_reference_ids(SCENE, 100)

@@ -44,7 +44,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import CostModel, Flow
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import MakeEngine, StartupError, engine_options, engine_over, make_tiers
+from mapless_server.serve.assembly import MakeEngine, Parts, StartupError, engine_options, engine_over, make_tiers
 from mapless_server.serve.warm_up import ROUNDS, warm_up, warm_up_stronger
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -58,7 +58,7 @@ TRUTH = np.array([0.25, 0.025, 0.0])
 async def warm(folder: Path, tiers: Sequence[Tier], method: Method | None = None) -> AsyncIterator[QueueEngine]:
     """An engine that is about to be warmed up; it is when the block is left."""
     with Store.open(folder) as store:
-        engine = engine_over(store, tiers, EngineOptions(), method=method)
+        engine = engine_over(store, tiers, EngineOptions(), Parts(method=method))
         try:
             yield engine
             await warm_up(engine)
@@ -108,7 +108,7 @@ def engine_of(
         begin()
         extractors = [StandInExtractor(), *([] if stronger is None else [stronger])]
         tiers = [Tier(it, Pipeline(cast(Any, StandInReconstructor()))) for it in extractors]
-        return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize))
+        return engine_over(store, tiers, engine_options(settings), Parts(metrics, quota, whole(localize)))
 
     return make
 

@@ -25,7 +25,7 @@ from mapless_server.method.features.views import PosedView, ReconstructedView, R
 from mapless_server.method.structure import kept_depth
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import engine_options, engine_over, make_tiers
+from mapless_server.serve.assembly import Parts, engine_options, engine_over, make_tiers
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_tools.demo import Photograph, depth_map_m, room
@@ -91,9 +91,8 @@ def serving(data_dir: Path, network: Reconstructor | None = None, **options: Any
     """A real server of SIFT, with depths by a network if there is one, as the setting says."""
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
-        return engine_over(
-            store, make_tiers(settings), engine_options(settings), metrics, quota, None, None, metrics, network
-        )
+        parts = Parts(metrics, quota, background_observer=metrics, depth_network=network)
+        return engine_over(store, make_tiers(settings), engine_options(settings), parts)
 
     with serving_really(data_dir, make=make, **({"features": "sift"} | options)) as server:
         yield server

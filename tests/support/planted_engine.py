@@ -24,7 +24,7 @@ from mapless_server.method.rejection import Hint, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing, Sphere
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
-from mapless_server.serve.assembly import engine_over
+from mapless_server.serve.assembly import Parts, engine_over
 from mapless_server.store import Store
 from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
@@ -87,7 +87,7 @@ class Setting:
 
         self.tiers = [Tier(extractor, pipelines[name]) for name, extractor in self.extractors.items()]
         self.engine = engine_over(
-            self.store, self.tiers, EngineOptions(doubt=DOUBT), None, None, whole(method), DESCRIPTOR
+            self.store, self.tiers, EngineOptions(doubt=DOUBT), Parts(method=whole(method), descriptor=DESCRIPTOR)
         )
         self.loop = asyncio.new_event_loop()
 

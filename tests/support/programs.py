@@ -25,7 +25,7 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import engine_options, engine_over
+from mapless_server.serve.assembly import Parts, engine_options, engine_over
 from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import Store
@@ -159,7 +159,7 @@ def _main(folder: Path, kind: str, given: Sequence[str]) -> None:
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
-        return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize))
+        return engine_over(store, tiers, engine_options(settings), Parts(metrics, quota, whole(localize)))
 
     asyncio.run(serve(settings, make))
 

@@ -23,7 +23,7 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.structure.model import MetricScale, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import engine_options, engine_over
+from mapless_server.serve.assembly import Parts, engine_options, engine_over
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from support.servers import COVARIANCE, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
@@ -55,7 +55,9 @@ def localize(*arguments: Any) -> Answer:
 
 def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
     tiers = [Tier(StandInExtractor(), Pipeline(cast(Any, StandInReconstructor())))]
-    return engine_over(store, tiers, engine_options(settings), metrics, quota, whole(localize), StandInDescriptor())
+    return engine_over(
+        store, tiers, engine_options(settings), Parts(metrics, quota, whole(localize), StandInDescriptor())
+    )
 
 
 class StandInReplica(MaplessReplica):

@@ -35,7 +35,7 @@ from mapless_server.method.structure.model import MetricScale, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Abandoned
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import MakeEngine, engine_options, engine_over, make_engine
+from mapless_server.serve.assembly import MakeEngine, Parts, engine_options, engine_over, make_engine
 from mapless_server.serve.running import Running, running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -321,11 +321,11 @@ def serving(
 
     def make(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
         known.append(metrics)
-        arguments = engine_options(settings), metrics, quota, method or whole(stand_in)
+        options, parts = engine_options(settings), Parts(metrics, quota, method or whole(stand_in))
         if tier is not None:
-            return engine_over(store, [tier], *arguments)
+            return engine_over(store, [tier], options, parts)
         tiers = [Tier(extractor, Pipeline(cast(Any, StandInReconstructor()))) for extractor in extractors]
-        return engine_over(store, tiers, *arguments, StandInDescriptor(descriptor_name))
+        return engine_over(store, tiers, options, replace(parts, descriptor=StandInDescriptor(descriptor_name)))
 
     with listening(settings, store, make) as (running, stop):
         try:

@@ -28,7 +28,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.logs import configure_logging
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import engine_options, engine_over
+from mapless_server.serve.assembly import Parts, engine_options, engine_over
 from mapless_server.serve.libraries import configure_libraries
 from mapless_server.serve.run import serve
 from mapless_server.settings import Settings, load_settings
@@ -74,7 +74,7 @@ def no_op_method() -> Method:
 def make_no_op_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
     """An engine with the settings' queue and threads that computes nothing."""
     tiers = [Tier(BlindExtractor(), Pipeline())]
-    return engine_over(store, tiers, engine_options(settings), metrics, quota, no_op_method())
+    return engine_over(store, tiers, engine_options(settings), Parts(metrics, quota, no_op_method()))
 
 
 def main(data_dir: Path | None) -> None:

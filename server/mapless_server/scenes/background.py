@@ -76,6 +76,21 @@ class BackgroundOptions:
         check_bounds(self, "poll_s longest_poll_s", above=0)
 
 
+@dataclass(frozen=True, eq=False)
+class SceneWork:
+    """What is computed of scenes besides matches; None for what is not.
+
+    Attributes:
+        calibrations: made when all references are matched; they use depths.
+        depths: made before scenes are calibrated.
+        agreements: brought up to date after a scene's references are matched.
+    """
+
+    calibrations: SceneCalibrations | None = None
+    depths: SceneDepths | None = None
+    agreements: SceneAgreements | None = None
+
+
 class BackgroundMatching:
     """Matches the references of a store in a thread of its own."""
 
@@ -86,27 +101,24 @@ class BackgroundMatching:
         matchings: Mapping[TierMatching, PairFinder],
         is_idle: Callable[[], bool],
         observer: BackgroundObserver,
+        work: SceneWork | None = None,
         options: BackgroundOptions | None = None,
-        calibrations: SceneCalibrations | None = None,
-        depths: SceneDepths | None = None,
-        agreements: SceneAgreements | None = None,
     ) -> None:
         """Makes the object; nothing is matched before `start` or `match_waiting`.
 
         The matchings are ordered, the most important first, each with the finder that queries use for it. `is_idle` is
-        whether the server computes nothing for a caller. Depths of references are made before scenes are calibrated,
-        which uses them and happens when all references are matched; None makes none. The agreements of scenes are
-        brought up to date after their references are matched.
+        whether the server computes nothing for a caller.
         """
+        work = work or SceneWork()
         self._store = store
         self._pairs = PairStore(store.database)
         self._indexes = indexes
         self._matchings = matchings
         self._is_idle = is_idle
         self._observer = observer
-        self._calibrations = calibrations
-        self._depths = depths
-        self._agreements = agreements
+        self._calibrations = work.calibrations
+        self._depths = work.depths
+        self._agreements = work.agreements
         self.options = options or BackgroundOptions()
         self._progress = {matching.name: Progress() for matching in matchings}
         self._closing = threading.Event()

@@ -5,6 +5,7 @@ Nothing here imports torch unless the settings name a network.
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mapless_server.choices import AUTO, BEST_VARIANTS, OFF, STORED
@@ -28,7 +29,7 @@ from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import GlobalDescriptor
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import SceneTools
-from mapless_server.scenes.background import BackgroundMatching
+from mapless_server.scenes.background import BackgroundMatching, SceneWork
 from mapless_server.scenes.calibration.calibrator import Calibrator, SceneCalibrations
 from mapless_server.scenes.depth.scene_depths import DepthMaker, SceneDepths
 from mapless_server.scenes.indexes import SceneIndexes
@@ -125,33 +126,42 @@ def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateL
         descriptor = make_descriptor(settings, tiers[0].extractor)
         network = make_depth_network(settings, tiers)
         options = engine_options(settings)
-        return engine_over(store, tiers, options, metrics, quota, None, descriptor, metrics, network)
+        parts = Parts(metrics, quota, descriptor=descriptor, background_observer=metrics, depth_network=network)
+        return engine_over(store, tiers, options, parts)
     except UNUSABLE as error:
         raise StartupError(what_is_missing(error)) from error
 
 
-def engine_over(
-    store: Store,
-    tiers: Sequence[Tier],
-    options: EngineOptions,
-    observer: Observer | None = None,
-    quota: Quota | None = None,
-    method: Method | None = None,
-    descriptor: GlobalDescriptor | None = None,
-    pair_observer: BackgroundObserver | None = None,
-    depth_network: Reconstructor | None = None,
-) -> QueueEngine:
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Parts of an engine besides its tiers; each has a default.
+
+    Attributes:
+        observer, quota, method: see `QueueEngine`.
+        descriptor: chooses references; None makes one from the first tier's features.
+        background_observer: is notified of what is computed in the background.
+        depth_network: makes the depths that are stored with references; None makes none.
+    """
+
+    observer: Observer | None = None
+    quota: Quota | None = None
+    method: Method | None = None
+    descriptor: GlobalDescriptor | None = None
+    background_observer: BackgroundObserver = field(default_factory=BackgroundObserver)
+    depth_network: Reconstructor | None = None
+
+
+def engine_over(store: Store, tiers: Sequence[Tier], options: EngineOptions, parts: Parts | None = None) -> QueueEngine:
     """Makes an engine over tiers, the cheapest first, and the references in memory that it uses.
 
-    For observer, quota and method see `QueueEngine`. The descriptor chooses references; None makes one from the first
-    tier's features. The depth network makes the depths that are stored with references; None makes none. ValueError if
-    there is no tier, two have the same extractor or matcher, or the descriptor uses other features.
+    ValueError if there is no tier, two have the same extractor or matcher, or the descriptor uses other features.
     """
+    parts = parts or Parts()
+    observed, depth_network = parts.background_observer, parts.depth_network
     check_tiers(tiers)
     extractors = [tier.extractor for tier in tiers]
     first = extractors[0]
-    descriptor = descriptor or VladDescriptor.of(first)
-    observed = pair_observer or BackgroundObserver()
+    descriptor = parts.descriptor or VladDescriptor.of(first)
     depths = None
     if depth_network is not None or any(tier.uses_depths for tier in tiers):
         kind = None if depth_network is None else depth_kind(depth_network.name, depth_network.weights_sha256)
@@ -173,7 +183,7 @@ def engine_over(
     agreements = SceneAgreements(store, indexes, library, comparing.extractor, comparing.pipeline.matcher, observed)
     tools = SceneTools(library, indexes, descriptor, first, pairs)
     references = References(tools, retrievals, extractors, options.image_limits, agreements)
-    engine = QueueEngine(tiers, references, options, observer, quota, method)
+    engine = QueueEngine(tiers, references, options, parts.observer, parts.quota, parts.method)
     maker = None
     if depth_network is not None:
         maker = DepthMaker(indexes, first, tiers[0].pipeline.matcher, depth_network)
@@ -209,9 +219,11 @@ def _background_matching(
         finders | strong,
         lambda: engine.queue.job_count == 0,
         observer,
-        calibrations=SceneCalibrations(store, calibrator, observer, depths if first.uses_depths else None, agreements),
-        depths=made,
-        agreements=agreements,
+        SceneWork(
+            SceneCalibrations(store, calibrator, observer, depths if first.uses_depths else None, agreements),
+            made,
+            agreements,
+        ),
     )
 
 
