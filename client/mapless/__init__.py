@@ -17,7 +17,17 @@ the conversion between values and messages, report/ the HTML report of an answer
 """
 
 from . import aio
-from .answers import Accuracy, FramedPose, Hint, Hypothesis, IntrinsicsCheck, LocalizationResult, PriorCheck, Rejected
+from .answers import (
+    Accuracy,
+    FramedPose,
+    Hint,
+    Hypothesis,
+    IntrinsicsCheck,
+    LocalizationResult,
+    PriorCheck,
+    Rejected,
+    UsedIntrinsics,
+)
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
 from .diagnostics import Attempt, Debug, Diagnostics, LadderCut, ReferenceUse, ScaleEstimate
@@ -115,6 +125,7 @@ __all__ = [
     "TrackingJump",
     "Unauthenticated",
     "Unavailable",
+    "UsedIntrinsics",
     "aio",
     "localize",
     "read_camera",

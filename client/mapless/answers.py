@@ -5,7 +5,7 @@ from datetime import datetime
 
 from .diagnostics import Debug, Diagnostics
 from .geodesy import GeoPose
-from .geometry import Array, RigidTransform
+from .geometry import Array, Camera, RigidTransform
 
 DOUBTFUL_TRUST = 0.15
 """Below it, an answer looks worse than 17 of 20 right ones of difficult places: the intrinsics may be wrong."""
@@ -138,6 +138,34 @@ class IntrinsicsCheck:
 
 
 @dataclass(frozen=True)
+class UsedIntrinsics:
+    """The intrinsics that a photograph was read with.
+
+    Attributes:
+        camera: in pixels of the photograph; where the photograph says better than what was given or chosen, that.
+        source: "GIVEN"; "SCENE_CAMERA", of references; "EXIF", the focal length in the photograph's; or "ESTIMATED"
+            from its matches.
+        focal_sigma_px: standard deviation of the focal length along x.
+    """
+
+    camera: Camera
+    source: str
+    focal_sigma_px: float
+
+    def __str__(self) -> str:
+        source = _SOURCES.get(self.source, self.source)
+        return f"focal length {self.camera.focal_x_px:.1f} +- {self.focal_sigma_px:.1f} px, {source}"
+
+
+_SOURCES = {
+    "GIVEN": "as given",
+    "SCENE_CAMERA": "of the references' camera",
+    "EXIF": "by the photograph's EXIF",
+    "ESTIMATED": "estimated from the photograph",
+}
+
+
+@dataclass(frozen=True)
 class Hint:
     """Advice after a rejection.
 
@@ -190,6 +218,7 @@ class LocalizationResult:
         prior_checks: how the answer compares with each soft prior.
         intrinsics_checks: comparison of each intrinsic parameter with the photograph; empty for a pose without
             refinement.
+        used_intrinsics: the intrinsics with which it was computed; None of servers before 0.4.
         arbitrary_unit: whether lengths are in the scene's own, arbitrary unit, also where a name says metres.
         scale_source: the basis of its lengths: "REFERENCES", or "NETWORK" for a single reference.
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
@@ -220,6 +249,7 @@ class LocalizationResult:
     arbitrary_unit: bool = False
     scale_source: str = "REFERENCES"
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
+    used_intrinsics: UsedIntrinsics | None = None
 
     @property
     def world_from_session(self) -> RigidTransform | None:
@@ -239,6 +269,7 @@ class LocalizationResult:
             geo = self.geo_pose
             text.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
         text += [f"  prior     {check}" for check in self.prior_checks]
+        text += [f"  camera    {it}" for it in _chosen(self.used_intrinsics)]
         text += [f"  camera    {check}" for check in self.intrinsics_checks if check.differs]
         captured = f", {_CAPTURED}" if self.diagnostics.captured else ""
         tracked = ", tracked" if self.diagnostics.is_tracked else ""
@@ -266,6 +297,7 @@ class Rejected:
         hypotheses: contradictory poses, the best supported first, if the reason is "AMBIGUOUS"; or, if
             `include_imprecise_pose` was asked for, the one that is rejected for its radius alone, with its accuracy.
         intrinsics_checks: comparison of the intrinsics with the photograph, if a conflict is the reason.
+        used_intrinsics: the intrinsics that it was read with; None if none were given and none found.
         debug: the matches, if requested and found.
         capture_time, session_from_camera: as they were sent.
         is_final: always True.
@@ -280,10 +312,12 @@ class Rejected:
     hypotheses: tuple[Hypothesis, ...] = ()
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
     debug: Debug | None = None
+    used_intrinsics: UsedIntrinsics | None = None
     is_final: bool = field(default=True, init=False)
 
     def __str__(self) -> str:
         text = [rejection_text(self.reason, self.message, self.hint)]
+        text += [f"  read with a {it}" for it in _chosen(self.used_intrinsics)]
         for it in (it for it in self.hypotheses if it.accuracy is not None):
             pose, frame = it.world_from_camera, ""
             if it.in_axes is not None and it.in_axes.axes != "OPENCV":
@@ -314,6 +348,11 @@ def pose_lines(pose: RigidTransform, accuracy: Accuracy | None, is_arbitrary: bo
         f"  position  {x:.3f}  {y:.3f}  {z:.3f} {unit}{radii[0]}",
         f"  rotation  x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}{radii[1]}",
     ]
+
+
+def _chosen(used: UsedIntrinsics | None) -> list[UsedIntrinsics]:
+    """The intrinsics, if the server has chosen them."""
+    return [] if used is None or used.source == "GIVEN" else [used]
 
 
 def _outcome(answer: LocalizationResult) -> str:

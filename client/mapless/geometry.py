@@ -245,7 +245,11 @@ class Camera:
         """
         if not 0 < horizontal_fov_deg < 180:
             raise ValueError(f"horizontal_fov_deg must be above 0 and below 180, is {horizontal_fov_deg:g}")
-        focal_px = width_px / 2 / math.tan(math.radians(horizontal_fov_deg) / 2)
+        return cls.centred(width_px, height_px, width_px / 2 / math.tan(math.radians(horizontal_fov_deg) / 2))
+
+    @classmethod
+    def centred(cls, width_px: int, height_px: int, focal_px: float) -> Camera:
+        """The pinhole camera with square pixels and a centred principal point."""
         return cls(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
 
     def matrix(self) -> Array:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from . import names, wire
-from .answers import Accuracy, Hypothesis, LocalizationResult, Rejected
+from .answers import Accuracy, Hypothesis, LocalizationResult, Rejected, UsedIntrinsics
 from .diagnostics import Attempt, Debug, Diagnostics
 from .geodesy import Datum, GeoPose
 from .geometry import Array, Camera, Quaternion, RigidTransform, Similarity
@@ -97,6 +97,11 @@ def _debug(message: pb.Debug, path: str) -> Debug:
     )
 
 
+def _used_intrinsics(message: pb.UsedIntrinsics, path: str) -> UsedIntrinsics:
+    camera = wire.camera_from_message(message.intrinsics, wire.joined(path, "intrinsics"))
+    return read(UsedIntrinsics, message, path, camera=camera)
+
+
 def _attempt(message: pb.Attempt, path: str) -> Attempt:
     times = {"duration_s": _seconds(message.duration), "processor_s": _seconds(message.processor_duration)}
     return read(Attempt, message, path, **times)
@@ -137,6 +142,7 @@ _READERS: dict[Any, Callable[[Any, str], Any]] = {
     GeoPose: _geo_pose,
     ImageReport: _image_report,
     RigidTransform: wire.transform_from_message,
+    UsedIntrinsics: _used_intrinsics,
     Vector: direction_from_message,
     datetime: lambda timestamp, path: timestamp.ToDatetime(timezone.utc),
 }

@@ -24,7 +24,7 @@ _lock = threading.Lock()
 
 def localize(
     image: ImageSource,
-    camera: Camera,
+    camera: Camera | None = None,
     scene: str | None = None,
     *,
     address: str | None = None,
@@ -40,7 +40,8 @@ def localize(
 
     Args:
         image: the photograph.
-        camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation.
+        camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation; None if it is
+            not known, see `Client.localize`.
         scene: the scene; None for MAPLESS_SCENE, or else the server's only scene, which costs another call.
         address: "host:port"; None for MAPLESS_ADDRESS, or else localhost:50051.
         options: options of the connection; None for no encryption, with the token of MAPLESS_TOKEN if it is set.

@@ -337,9 +337,12 @@ def test_a_photograph_beside_a_cameras_json_needs_no_camera(run: Run, scene: str
     assert (code, answer["inlier_count"], report) == (0, 90, "")
     code, _, error_text = run("localize", scene, folder / "images" / "1.png")
     assert (code, "does not list" in error_text) == (2, True)
+
+
+def test_a_photograph_without_a_camera_is_sent_without(run: Run, scene: str, folder: Path) -> None:
     (folder / "cameras.json").unlink()
-    code, _, error_text = run("localize", scene, folder / "images" / "0.png")
-    assert (code, "give --camera" in error_text) == (2, True)
+    code, answer, report = run("localize", scene, folder / "images" / "0.png")
+    assert (code, answer["inlier_count"], answer["used_intrinsics"], report) == (0, 90, None, "")
 
 
 class TestOnATerminal:
@@ -428,7 +431,6 @@ def test_a_scene_has_its_place_on_the_earth(run: Run) -> None:
     [
         (["--parallel", "0"], "--parallel must be at least 1, is 0"),
         (["--rerank"], "--rerank needs --reference"),
-        ([], "has no cameras.json: give --camera"),
         (["--camera", FOUR_NUMBERS], "1.png"),
         (["--camera", "1,2,3"], "1,2,3: a camera must be four numbers"),
         (["--camera", "1,2,3,4,5"], "four numbers"),

@@ -27,8 +27,8 @@ M = TypeVar("M", pb.RigImage, pb.SequenceFrame)
 async def _localize_request(
     connection: Connection,
     image: ImageSource,
-    camera: Camera,
-    scene: str,
+    camera: Camera | None = None,
+    scene: str = "",
     references: Sequence[str] = (),
     *,
     priors: Priors | None = None,
@@ -56,7 +56,9 @@ async def _localize_request(
 
     Args:
         image: the photograph.
-        camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation.
+        camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation; None if it is
+            not known: the server then takes the focal length in the file's EXIF, or the camera of references with the
+            same sides, or estimates it (`LocalizationResult.used_intrinsics`).
         scene: the scene to localize in.
         references: the references to use, most similar first, at most 64; empty: the server chooses.
         priors: knowledge of the pose before the photograph is used, for example its position.
@@ -90,7 +92,7 @@ async def _localize_request(
         references=reference_names(scene, references),
         image=await connection.unblocked(read_image, image),
         mask=await connection.unblocked(read_mask, mask),
-        intrinsics=wire.camera_to_message(camera),
+        intrinsics=None if camera is None else wire.camera_to_message(camera),
         options=_options_to_message(
             variant=wire.enum_value(pb.Variant, variant),
             scale_strategy=wire.enum_value(pb.ScaleStrategy, scale_strategy),

@@ -323,7 +323,9 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
     command.add_argument("scene")
     command.add_argument("photo", type=Path, help="or a folder of photographs")
     command.add_argument(
-        "--camera", help="the camera of the photographs, see `mapless --help`; not needed with a cameras.json"
+        "--camera",
+        help="the camera of the photographs, see `mapless --help` (default: those that the folder's cameras.json has; "
+        "without one, the server chooses it by EXIF, references and matches)",
     )
     command.add_argument(
         "--mask",

@@ -30,11 +30,11 @@ _FIELDS_OF_PHOTOS = ("image", "intrinsics", "mask")
 
 @dataclass(frozen=True)
 class Photo:
-    """A photograph to localize, its name in the output, its camera, and its mask, if it has one."""
+    """A photograph to localize, its name in the output, its camera, None if it is not known, and its mask, if any."""
 
     path: Path
     name: str
-    camera: Camera
+    camera: Camera | None
     mask: Path | None = None
 
 
@@ -105,11 +105,9 @@ def _print_path(arguments: argparse.Namespace) -> None:
 def photos_of(folder: Path, camera: str | None) -> list[Photo]:
     """Lists the photographs of a folder: those of its cameras.json, or all of them if one camera is given.
 
-    ValueError without photographs or without a camera.
+    The server chooses the cameras if there is neither. ValueError without photographs.
     """
-    if camera is None:
-        if not (folder / FOLDER_FILE).is_file():
-            raise ValueError(f"{folder} has no {FOLDER_FILE}: give --camera, the camera of all its photographs")
+    if camera is None and (folder / FOLDER_FILE).is_file():
         cameras = read_cameras(folder / FOLDER_FILE)
         if not cameras:
             raise ValueError(f"{folder / FOLDER_FILE} lists no photographs")
@@ -118,15 +116,15 @@ def photos_of(folder: Path, camera: str | None) -> list[Photo]:
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
     if not paths:
         raise ValueError(f"{folder} holds no photographs ({', '.join(sorted(ENDINGS))})")
-    return [Photo(path, path.name, read_camera(camera, path)) for path in paths]
+    return [Photo(path, path.name, None if camera is None else read_camera(camera, path)) for path in paths]
 
 
-def _camera_beside(path: Path) -> Camera:
-    """Camera of a photograph, from the cameras.json of its folder or of the folder above."""
+def _camera_beside(path: Path) -> Camera | None:
+    """Camera of a photograph, from the cameras.json of its folder or of the folder above; None if there is none."""
     for folder in path.resolve().parents[:2]:
         if (folder / FOLDER_FILE).is_file():
             return read_camera(folder / FOLDER_FILE, path)
-    raise ValueError(f"give --camera, the camera of the photograph: there is no {FOLDER_FILE} beside it")
+    return None
 
 
 def _listed_mask(path: Path, camera: str | None) -> Path | None:
@@ -238,7 +236,8 @@ def _row(photo: Photo, width: int, outcome: Outcome, as_json: bool, arguments: a
 
 def _json(photo: Photo, answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> dict[str, Any]:
     """An answer as JSON values; with --debug, beside what `mapless-server draw` needs to draw it."""
-    drawn = {"photo": photo.name, "camera": output.plain(photo.camera)} if arguments.debug else {}
+    used = None if answer.used_intrinsics is None else answer.used_intrinsics.camera
+    drawn = {"photo": photo.name, "camera": output.plain(photo.camera or used)} if arguments.debug else {}
     return {**drawn, **output.plain(answer)}
 
 

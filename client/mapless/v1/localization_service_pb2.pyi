@@ -33,6 +33,14 @@ class ScaleStrategy(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SCALE_STRATEGY_TRAJECTORY: _ClassVar[ScaleStrategy]
     SCALE_STRATEGY_TWO_STAGE: _ClassVar[ScaleStrategy]
 
+class IntrinsicsSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    INTRINSICS_SOURCE_UNSPECIFIED: _ClassVar[IntrinsicsSource]
+    INTRINSICS_SOURCE_GIVEN: _ClassVar[IntrinsicsSource]
+    INTRINSICS_SOURCE_SCENE_CAMERA: _ClassVar[IntrinsicsSource]
+    INTRINSICS_SOURCE_EXIF: _ClassVar[IntrinsicsSource]
+    INTRINSICS_SOURCE_ESTIMATED: _ClassVar[IntrinsicsSource]
+
 class ScaleSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     SCALE_SOURCE_UNSPECIFIED: _ClassVar[ScaleSource]
@@ -126,6 +134,11 @@ SCALE_STRATEGY_UNSPECIFIED: ScaleStrategy
 SCALE_STRATEGY_TRIANGULATION: ScaleStrategy
 SCALE_STRATEGY_TRAJECTORY: ScaleStrategy
 SCALE_STRATEGY_TWO_STAGE: ScaleStrategy
+INTRINSICS_SOURCE_UNSPECIFIED: IntrinsicsSource
+INTRINSICS_SOURCE_GIVEN: IntrinsicsSource
+INTRINSICS_SOURCE_SCENE_CAMERA: IntrinsicsSource
+INTRINSICS_SOURCE_EXIF: IntrinsicsSource
+INTRINSICS_SOURCE_ESTIMATED: IntrinsicsSource
 SCALE_SOURCE_UNSPECIFIED: ScaleSource
 SCALE_SOURCE_REFERENCES: ScaleSource
 SCALE_SOURCE_NETWORK: ScaleSource
@@ -324,7 +337,7 @@ class LocalizeProgressivelyResponse(_message.Message):
     def __init__(self, answer: _Optional[_Union[LocalizeResponse, _Mapping]] = ..., is_final: bool = ...) -> None: ...
 
 class Localization(_message.Message):
-    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks", "arbitrary_unit", "scale_source", "intrinsics_checks")
+    __slots__ = ("world_from_camera", "covariance", "accuracy", "pose_stage", "inlier_count", "match_count", "reprojection_error_px", "trust", "in_axes", "geo_pose", "prior_checks", "arbitrary_unit", "scale_source", "intrinsics_checks", "used_intrinsics")
     WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
@@ -339,6 +352,7 @@ class Localization(_message.Message):
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     SCALE_SOURCE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_CHECKS_FIELD_NUMBER: _ClassVar[int]
+    USED_INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     world_from_camera: _geometry_pb2.RigidTransform
     covariance: PoseCovariance
     accuracy: Accuracy
@@ -353,7 +367,18 @@ class Localization(_message.Message):
     arbitrary_unit: bool
     scale_source: ScaleSource
     intrinsics_checks: _containers.RepeatedCompositeFieldContainer[IntrinsicsCheck]
-    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., arbitrary_unit: bool = ..., scale_source: _Optional[_Union[ScaleSource, str]] = ..., intrinsics_checks: _Optional[_Iterable[_Union[IntrinsicsCheck, _Mapping]]] = ...) -> None: ...
+    used_intrinsics: UsedIntrinsics
+    def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., pose_stage: _Optional[_Union[PoseStage, str]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., trust: _Optional[float] = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., arbitrary_unit: bool = ..., scale_source: _Optional[_Union[ScaleSource, str]] = ..., intrinsics_checks: _Optional[_Iterable[_Union[IntrinsicsCheck, _Mapping]]] = ..., used_intrinsics: _Optional[_Union[UsedIntrinsics, _Mapping]] = ...) -> None: ...
+
+class UsedIntrinsics(_message.Message):
+    __slots__ = ("intrinsics", "source", "focal_sigma_px")
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    FOCAL_SIGMA_PX_FIELD_NUMBER: _ClassVar[int]
+    intrinsics: _geometry_pb2.CameraIntrinsics
+    source: IntrinsicsSource
+    focal_sigma_px: float
+    def __init__(self, intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., source: _Optional[_Union[IntrinsicsSource, str]] = ..., focal_sigma_px: _Optional[float] = ...) -> None: ...
 
 class IntrinsicsCheck(_message.Message):
     __slots__ = ("parameter", "given", "estimated", "estimated_sigma", "given_sigma", "conflict", "used")
@@ -454,18 +479,20 @@ class Accuracy(_message.Message):
     def __init__(self, position_68_m: _Optional[float] = ..., position_95_m: _Optional[float] = ..., rotation_68_deg: _Optional[float] = ..., rotation_95_deg: _Optional[float] = ..., calibrated: bool = ..., calibration: _Optional[_Union[CalibrationSource, str]] = ..., sample_size: _Optional[int] = ...) -> None: ...
 
 class Rejection(_message.Message):
-    __slots__ = ("reason", "message", "hint", "hypotheses", "intrinsics_checks")
+    __slots__ = ("reason", "message", "hint", "hypotheses", "intrinsics_checks", "used_intrinsics")
     REASON_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
     HINT_FIELD_NUMBER: _ClassVar[int]
     HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_CHECKS_FIELD_NUMBER: _ClassVar[int]
+    USED_INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     reason: RejectionReason
     message: str
     hint: Hint
     hypotheses: _containers.RepeatedCompositeFieldContainer[Hypothesis]
     intrinsics_checks: _containers.RepeatedCompositeFieldContainer[IntrinsicsCheck]
-    def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ..., hint: _Optional[_Union[Hint, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., intrinsics_checks: _Optional[_Iterable[_Union[IntrinsicsCheck, _Mapping]]] = ...) -> None: ...
+    used_intrinsics: UsedIntrinsics
+    def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ..., hint: _Optional[_Union[Hint, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., intrinsics_checks: _Optional[_Iterable[_Union[IntrinsicsCheck, _Mapping]]] = ..., used_intrinsics: _Optional[_Union[UsedIntrinsics, _Mapping]] = ...) -> None: ...
 
 class Hint(_message.Message):
     __slots__ = ("stage", "advice", "message", "best_reference")

@@ -13,11 +13,12 @@ import numpy as np
 from mapless_server import __version__
 from mapless_server.images import ImageLimits, decode_mask
 from mapless_server.method.bundle.priors import NO_PRIORS, Priors
-from mapless_server.method.options import Variant
+from mapless_server.method.options import ChosenCamera, Variant
 from mapless_server.store import SceneAttributes, calibration_kind
 
 if TYPE_CHECKING:  # services need not load what computes
     from mapless.geometry import Camera
+    from mapless_server.images.exif import Exif
     from mapless_server.method.features.extractors import FeatureExtractor
     from mapless_server.method.features.views import Ignored, PosedView, View
     from mapless_server.method.judge.answer import Answer
@@ -33,13 +34,15 @@ if TYPE_CHECKING:  # services need not load what computes
 class Photo:
     """An encoded image and its camera, perhaps with a mask of ignored pixels, a PNG; empty for none.
 
-    `field` is the image's path in the request, for error messages.
+    `field` is the image's path in the request, for error messages. `exif`, of a photograph without intrinsics, is what
+    its camera is chosen by; of `camera` then only the size is known.
     """
 
     image: bytes
     camera: Camera
     field: str
     mask: bytes = b""
+    exif: Exif | None = None
 
     @property
     def size_bytes(self) -> int:
@@ -182,8 +185,8 @@ class Query:
     @property
     def can_be_tracked(self) -> bool:
         """Whether its prior and options allow tracking, see `tracking`."""
-        prior = self.priors.pose
-        if prior is None or self.reference_ids or self.is_part or self.options.variant is not Variant.BEST:
+        prior, is_chosen = self.priors.pose, self.photo.exif is not None
+        if prior is None or self.reference_ids or self.is_part or self.options.variant is not Variant.BEST or is_chosen:
             return False
         sigma = math.sqrt(float(np.linalg.eigvalsh(prior.covariance[3:, 3:])[-1]))
         return sigma <= math.radians(MAX_TRACKED_SIGMA_DEG)
@@ -257,6 +260,8 @@ class Result:
             features, references or rasters than the first ones begins with the extractor's name and a slash.
         attempts: the attempts that were made, in order.
         cuts: attempts that were left out, or not finished, for another reason than what the photograph shows.
+        camera: the camera that was chosen for a photograph without intrinsics; None if it came with some, or none was
+            found.
     """
 
     answer: Answer
@@ -270,6 +275,7 @@ class Result:
     stage_seconds: dict[str, float] = field(default_factory=dict)
     attempts: tuple[Tried, ...] = ()
     cuts: tuple[LadderCut, ...] = ()
+    camera: ChosenCamera | None = None
 
     @property
     def generation(self) -> int:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from mapless_server.engine.photo_views import QueryViews
 from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.judge.hypothesis import Attempt, Where, first_attempt
-from mapless_server.method.options import StageContext
+from mapless_server.method.options import ChosenCamera, StageContext
 from mapless_server.method.rejection import PoseHypothesis
 from mapless_server.scenes import Choice
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
@@ -43,6 +43,7 @@ class Material:
         unmatched: indices of the references that the network has still to match, each in a step of its own, so that a
             busy server computes for other callers in between.
         rematched: indices of those that it has matched.
+        camera: the camera of the view that was chosen by these matches; None if the photograph came with intrinsics.
     """
 
     basis: Attempt
@@ -56,6 +57,7 @@ class Material:
     is_strong: bool = False
     unmatched: tuple[int, ...] = ()
     rematched: tuple[int, ...] = ()
+    camera: ChosenCamera | None = None
 
     def serves(self, attempt: Attempt) -> bool:
         """Whether an attempt is computed from it."""

@@ -46,7 +46,7 @@ from mapless_server.scheduling import (
     processor_s,
 )
 
-from . import choosing, cutting, tracking
+from . import cameras, choosing, cutting, tracking
 from .failures import failure_of
 from .query import COARSE, PREPARE, REFINE, TRACK, CutReason, LadderCut, Result, Tier
 from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
@@ -245,21 +245,33 @@ class QueryStages:
             names = [f"{search.kind}, {it}" for it in ("rematch", "matched")]
             steps = zip(names, (search, matched), strict=True)
             return self._next(search, *(Step(PREPARE, name, name, it, search.kind) for name, it in steps))
-        query, tier = search.query, self._verdicts.tier(search.attempt)
-        prepared = self._method.prepare(
+        prepared = self._prepared(search, material)
+        if search.query.photo.exif is not None and isinstance(prepared, Prepared):
+            read = cameras.with_camera(search, prepared)
+            if isinstance(read, Material):
+                matched = replace(matched, material=read)
+                prepared = self._prepared(search, read)
+            else:
+                prepared = read
+        if isinstance(prepared, Rejection):
+            return self._conclude(matched, found_by(search.attempt, Answer(prepared), self._doubt))
+        matched = replace(matched, prepared=prepared)
+        return self._next(matched, matched.step(COARSE, prepared.bucket))
+
+    def _prepared(self, search: Search, material: Material) -> Prepared | Rejection:
+        """The photograph with its references, matched; with the standard deviations of a camera that was chosen."""
+        query, camera = search.query, material.camera
+        options = query.options if camera is None else replace(query.options, intrinsics=camera.sigma)
+        return self._method.prepare(
             material.view,
             material.references,
-            self._verdicts.pipeline(search, tier),
-            query.options,
+            self._verdicts.pipeline(search, self._verdicts.tier(search.attempt)),
+            options,
             search.context,
             material.query_matches,
             query.priors,
             not search.attributes.arbitrary_unit,
         )
-        if isinstance(prepared, Rejection):
-            return self._conclude(matched, found_by(search.attempt, Answer(prepared), self._doubt))
-        matched = replace(matched, prepared=prepared)
-        return self._next(matched, matched.step(COARSE, prepared.bucket))
 
     def _has_time_to_rematch(self, search: Search) -> bool:
         """Whether another reference is left to be matched, and time for it before the pose must be computed."""

@@ -115,6 +115,7 @@ class Verdicts:
             _other_choices(search, material),
             material.attributes,
             search.seconds(self.tier(search.attempt).features),
+            camera=material.camera,
         )
 
 

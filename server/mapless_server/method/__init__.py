@@ -14,6 +14,7 @@ pose/            pose estimators: from points, lines, depths, several cameras
 coarse/          query and references reconstructed together, up to scale; the metric scale
 judge/           whether a pose is accepted, and its trust; which of several is answered; the answer and its hints
 groups/          several photographs posed together
+unknown_camera   the camera of a photograph without intrinsics
 pipeline         a query between the stages
 solve            one attempt's stages in order
 ladder           which attempt follows another

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
 
+from mapless.geometry import Camera
 from mapless_server.bounds import check_bounds
 
 from .bundle.priors import IntrinsicsSigma
@@ -34,6 +35,25 @@ class ScaleStrategy(str, Enum):
     TRIANGULATION = "triangulation"
     TRAJECTORY = "trajectory"
     TWO_STAGE = "two_stage"
+
+
+class IntrinsicsSource(str, Enum):
+    """Sources of a photograph's intrinsics, in the order in which they are used."""
+
+    GIVEN = "given"
+    SCENE_CAMERA = "scene_camera"
+    """References, by the EXIF of both photographs, or by their sides and the matches."""
+    EXIF = "exif"
+    ESTIMATED = "estimated"
+
+
+@dataclass(frozen=True)
+class ChosenCamera:
+    """A camera of a photograph without intrinsics, how far it may be off without the matches, and where it is from."""
+
+    camera: Camera
+    sigma: IntrinsicsSigma
+    source: IntrinsicsSource
 
 
 @dataclass(frozen=True)

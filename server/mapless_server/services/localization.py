@@ -106,7 +106,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         engine, given_count = self._engine(), 0
 
         def to_message(result: Result) -> pb.LocalizeResponse:
-            response = outcome_to_message(result, query.options, frames)
+            response = outcome_to_message(result, query.options, frames, query.photo)
             for echoed in ("capture_time", "session_from_camera"):
                 if request.HasField(echoed):
                     getattr(response, echoed).CopyFrom(getattr(request, echoed))

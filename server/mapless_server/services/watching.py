@@ -92,8 +92,9 @@ class Watchers:
         if debug is not None:
             answer.debug.CopyFrom(debug)
         # A copy, since a field of a message keeps the whole message in memory, with its image.
-        intrinsics = geometry_pb.CameraIntrinsics()
-        intrinsics.CopyFrom(request.intrinsics)
+        used = response.rejection if response.HasField("rejection") else response.localization
+        intrinsics, given = geometry_pb.CameraIntrinsics(), request.HasField("intrinsics")
+        intrinsics.CopyFrom(request.intrinsics if given else used.used_intrinsics.intrinsics)
         watched = request.image, intrinsics, answer
         for watcher in self.by_scene.get(scene_key, ()):
             watcher.put(watched)

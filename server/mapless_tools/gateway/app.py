@@ -156,7 +156,6 @@ class _Handlers:
                 photograph.camera,
                 scene,
                 priors=photograph.priors,
-                intrinsics_uncertainty=photograph.uncertainty,
                 confidential=photograph.is_confidential,
             )
             answer = await _while_connected(request, localizing)

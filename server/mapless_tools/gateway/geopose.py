@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 from pydantic import ValidationError
 
-from mapless import Camera, Datum, GeoPositionPrior, IntrinsicsUncertainty, LocalizationResult, PosePrior, Priors
+from mapless import Camera, Datum, GeoPositionPrior, LocalizationResult, PosePrior, Priors
 from mapless.geodesy import GeoPose, pose_from_geopose
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits
 from mapless_server.images.decode import image_size
-from mapless_server.images.exif import focal_of, read_exif
 from mapless_tools.ingest.formats.colmap.cameras import PARAMETERS, ColmapCamera
 
 from .guard import Failure, checked_json
@@ -49,15 +48,14 @@ _UNKNOWN_MODEL = "UNKNOWN"
 class Photograph:
     """The contents of a request; its id and time are for the response.
 
-    The uncertainty is None for a calibrated camera. `prior_fields` has the path of each prior in the request, by the
-    field of the call. If confidential, the photograph is used for the answer only.
+    The camera is None where the request has none: the server then chooses it. `prior_fields` has the path of each prior
+    in the request, by the field of the call. If confidential, the photograph is used for the answer only.
     """
 
     request_id: str
     timestamp_ms: float
     image: bytes
-    camera: Camera
-    uncertainty: IntrinsicsUncertainty | None
+    camera: Camera | None
     priors: Priors
     prior_fields: dict[str, str]
     is_confidential: bool
@@ -108,7 +106,7 @@ def photograph_of(request: Request, datum: Datum, now_s: float | None = None) ->
     _check_past(reading.timestamp, now_ms, f"{where}.timestamp")
     taken_ms = reading.timestamp or request.timestamp
     image, (width_px, height_px) = _image_of(reading, where)
-    camera, uncertainty = _camera_of(reading.params, image, width_px, height_px, f"{where}.params")
+    camera = _camera_of(reading.params, width_px, height_px, f"{where}.params")
     geo, geo_field = _position_prior(readings.geolocationReadings, taken_ms, now_ms)
     pose, pose_field = _pose_prior(request.priorPoses, taken_ms, now_ms, datum)
     return Photograph(
@@ -116,7 +114,6 @@ def photograph_of(request: Request, datum: Datum, now_s: float | None = None) ->
         taken_ms,
         image,
         camera,
-        uncertainty,
         Priors(geo_position=geo, pose=pose),
         {
             "image": f"{where}.imageBytes",
@@ -178,25 +175,11 @@ def _encoded(pixels: bytes, width_px: int, height_px: int, channels: int) -> byt
     return png.tobytes()
 
 
-def _camera_of(
-    given: CameraParameters | None, image: bytes, width_px: int, height_px: int, where: str
-) -> tuple[Camera, IntrinsicsUncertainty | None]:
-    """Makes the camera of the parameters; without them, of the focal length in the file's EXIF."""
+def _camera_of(given: CameraParameters | None, width_px: int, height_px: int, where: str) -> Camera | None:
+    """Makes the camera of the parameters; None without them."""
     model = given.model.upper() if given is not None else _UNKNOWN_MODEL
     if given is None or (model.startswith(_UNKNOWN_MODEL) and not given.modelParams):
-        try:
-            focal = focal_of(read_exif(image), width_px, height_px)
-        except ValueError as error:
-            raise Failure(str(error), field=f"{where}.model") from None
-        if focal is None:
-            raise Failure(
-                "the camera's intrinsics are needed: one of COLMAP's models and its parameters, or a file whose EXIF "
-                "has the focal length in 35 mm film",
-                field=f"{where}.model",
-            )
-        centre = ((width_px - 1) / 2, (height_px - 1) / 2)
-        uncertainty = IntrinsicsUncertainty(focal_sigma_px=focal.sigma_px)
-        return Camera(width_px, height_px, focal.focal_px, focal.focal_px, *centre), uncertainty
+        return None
     if model not in PARAMETERS:
         raise Failure(f"is none of COLMAP's models: {given.model[:40]!a}", field=f"{where}.model")
     names = PARAMETERS[model]
@@ -206,7 +189,7 @@ def _camera_of(
             field=f"{where}.modelParams",
         )
     try:
-        return ColmapCamera(1, model, width_px, height_px, given.modelParams).camera(), None
+        return ColmapCamera(1, model, width_px, height_px, given.modelParams).camera()
     except ValueError as error:
         raise Failure(str(error), field=where) from None
 

@@ -1,4 +1,4 @@
-"""One photograph as a form, for curl: converts a photograph and its intrinsics to a request of Localize."""
+"""One photograph as a form, for curl: converts it, and its intrinsics if there are any, to a request of Localize."""
 
 from collections.abc import AsyncGenerator
 from typing import Any
@@ -20,17 +20,16 @@ _MAX_PART_BYTES = 2**20
 async def read_form(headers: Headers, body: AsyncGenerator[bytes, None], default_scene: str) -> pb.LocalizeRequest:
     """Reads the request that a form describes; Failure names the wrong field. The default scene may be empty."""
     if not headers.get("content-type", "").startswith("multipart/form-data"):
-        example = "curl -F image=@photo.jpg -F intrinsics=@camera.json"
+        example = "curl -F image=@photo.jpg"
         raise Failure(f"must be multipart/form-data, as of {example}", 415, field="content-type")
     parts = await _parts(headers, body)
     request = pb.LocalizeRequest()
     _parse(parts.get("request", b"{}"), request, "request")
     if "intrinsics" in parts:
         _parse(parts["intrinsics"], request.intrinsics, "intrinsics")
-    for field, value in (("image", parts.get("image", request.image)), ("intrinsics", request.intrinsics.ByteSize())):
-        if not value:
-            raise Failure("is missing or empty", field=field)
     request.image = parts.get("image", request.image)
+    if not request.image:
+        raise Failure("is missing or empty", field="image")
     if "mask" in parts:
         request.mask = parts["mask"]
     scene = parts["scene"].decode(errors="replace") if "scene" in parts else request.scene or default_scene

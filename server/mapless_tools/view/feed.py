@@ -132,7 +132,7 @@ class Feed:
                 self.own.remove(digest)
                 continue
             self._count += 1 + message.missed_count
-            if not message.image:  # too large to be shown
+            if not (message.image and message.intrinsics.width_px):  # too large, or of a camera that nothing shows
                 continue
             camera = wire.camera_from_message(message.intrinsics, "intrinsics")
             self._show(Query(self._count, message.image, camera, answer_from_message(message.answer)))

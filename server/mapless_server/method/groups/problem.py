@@ -18,6 +18,7 @@ from ..bundle.priors import Priors
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import LEAST_DAMPING, solve_step, world_jacobian
+from ..pose.with_priors import MAX_MATCHES
 from ..structure.model import PointMatches
 from ..structure.structure import tracks_with_query
 from .images import MatchedImage
@@ -26,9 +27,6 @@ S = TypeVar("S", bound="GroupState")
 
 ADJUST = AdjustOptions()
 """Options as for one photograph."""
-
-MAX_MATCHES = 300
-"""Largest number of matches of a photograph, evenly thinned; several photographs have enough together."""
 
 
 class GroupState(Protocol):

@@ -222,8 +222,23 @@ def _too_uncertain(support: PosedSupport) -> Rejection | None:
     )
     strongest = np.argsort(-np.array(support.inliers_by_reference()), kind="stable")[:2]
     names = [support.references[i].name for i in strongest]
+    if unknown := _unknown_focal(support):
+        advice = "Give the photograph's intrinsics, or take one that shows things at several distances."
+        hint = Hint("judge", Advice.CHECK_CALIBRATION, advice, names[0])
+        return Rejection(RejectionReason.GATE, f"{message}: {unknown}", hint)
     advice = f"Add references that show the same from other places: {' and '.join(names)} alone do not suffice."
     return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.ADD_REFERENCES, advice, names[0]))
+
+
+def _unknown_focal(support: PosedSupport) -> str:
+    """Says that most of the position's variance is that of the intrinsics, and why; empty if it is not."""
+    evidence, covariance = support.estimate.intrinsics, support.estimate.covariance
+    if evidence is None or 2 * np.trace(evidence.pose_covariance[:3, :3]) < np.trace(covariance[:3, :3]):
+        return ""
+    return (
+        f"its focal length is known to {100 * math.sqrt(evidence.covariance[0, 0]):.1f} %, and what it shows, as of a "
+        "flat wall, does not tell a longer one from a larger distance"
+    )
 
 
 def _imprecise(support: PosedSupport, covariance: Array) -> PoseHypothesis:

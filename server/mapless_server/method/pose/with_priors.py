@@ -55,8 +55,8 @@ WEAK_INFORMATION = np.diag([1e-6] * 3 + [1e-2] * 3)
 """Information of an unknown pose: within kilometres, of any orientation."""
 
 MAX_MATCHES = 300
-"""Largest number for RANSAC with gravity, evenly thinned; more do not improve the choice, and scoring is linear in
-them."""
+"""Largest number for RANSAC with gravity, and of each photograph of a group, evenly thinned; more do not improve the
+choice, and scoring is linear in them."""
 
 BATCH, MAX_SAMPLES = 64, 512
 """Samples that are scored together, and at most."""

@@ -1,5 +1,6 @@
 """Messages of an answer: localization with its calibrated radii, or rejection; frames, and diagnostics."""
 
+import math
 from dataclasses import dataclass
 
 from mapless import wire
@@ -8,10 +9,11 @@ from mapless.geodesy import Datum, geopose
 from mapless.geometry import Array, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
-from mapless_server.engine.query import Result
+from mapless_server.engine.query import Photo, Result
 from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance, viewpoint_gap
+from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.judge.answer import Localization
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import IntrinsicsSource, LocalizeOptions
 from mapless_server.method.rejection import PoseHypothesis, Rejection
 from mapless_server.store import SceneAttributes
 
@@ -40,13 +42,37 @@ def answer_frames_of(request: pb.LocalizeRequest) -> AnswerFrames:
     return AnswerFrames(axes_from_message(options), session_from_message(request), options.include_imprecise_pose)
 
 
-def outcome_to_message(result: Result, options: LocalizeOptions, frames: AnswerFrames) -> pb.LocalizeResponse:
-    """Makes the response, with the outcome only."""
+def outcome_to_message(
+    result: Result, options: LocalizeOptions, frames: AnswerFrames, photo: Photo
+) -> pb.LocalizeResponse:
+    """Makes the response to a photograph, with the outcome only."""
     outcome = result.answer.outcome
     if isinstance(outcome, Rejection):
-        return pb.LocalizeResponse(rejection=result_to_rejection(result, options, frames))
+        rejection = result_to_rejection(result, options, frames)
+        _set_used_intrinsics(rejection, result, options, photo)
+        return pb.LocalizeResponse(rejection=rejection)
     radii = None if outcome.covariance is None else _radii_of(result, options, outcome.covariance)
-    return pb.LocalizeResponse(localization=_localization_to_message(outcome, radii, result.attributes, frames))
+    localization = _localization_to_message(outcome, radii, result.attributes, frames)
+    _set_used_intrinsics(localization, result, options, photo)
+    return pb.LocalizeResponse(localization=localization)
+
+
+def _set_used_intrinsics(
+    message: pb.Localization | pb.Rejection, result: Result, options: LocalizeOptions, photo: Photo
+) -> None:
+    """Sets the intrinsics with which the pose was computed; leaves them out where none were given or found."""
+    chosen, support = result.camera, result.answer.support
+    if chosen is None and photo.exif is not None:
+        return
+    camera, source = (chosen.camera, chosen.source) if chosen else (photo.camera, IntrinsicsSource.GIVEN)
+    sigma = (chosen.sigma if chosen else options.intrinsics) or IntrinsicsSigma()
+    focal_share = sigma.focal_share
+    if isinstance(support, PosedSupport) and (evidence := support.estimate.intrinsics) is not None:
+        focal_share = math.sqrt(evidence.covariance[0, 0])
+        camera = support.query.photograph.camera if support.query.photograph else camera
+    message.used_intrinsics.intrinsics.CopyFrom(wire.camera_to_message(camera))
+    message.used_intrinsics.source = enum_to_message(source, pb.IntrinsicsSource)
+    message.used_intrinsics.focal_sigma_px = focal_share * camera.focal_x_px
 
 
 def result_to_rejection(result: Result, options: LocalizeOptions, frames: AnswerFrames) -> pb.Rejection:

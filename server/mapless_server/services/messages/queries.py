@@ -17,7 +17,7 @@ from google.protobuf.message import Message
 
 from mapless import names, wire
 from mapless.geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, GeoPosition, world_from_enu_at, world_from_geodetic
-from mapless.geometry import MAX_COORDINATE_M, Array
+from mapless.geometry import MAX_COORDINATE_M, Array, Camera
 from mapless.lenses import lens_model_of
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
@@ -25,6 +25,7 @@ from mapless.wire import FieldError, camera_from_message, joined, transform_from
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
 from mapless_server.images import ImageLimits, check_mask, image_size
+from mapless_server.images.exif import read_exif
 from mapless_server.method.bundle.priors import (
     NO_PRIORS,
     GravityPrior,
@@ -110,17 +111,23 @@ def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: in
     return tuple(reference_ids)
 
 
-def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
+def photo_from_message(message: Any, path: str, limits: ImageLimits, needs_intrinsics: bool = True) -> Photo:
     """Reads the photograph of a message's `image` and `intrinsics`; reads only the image's header, so it is fast.
 
-    Also reads its `mask`. FieldError if the intrinsics are missing, out of range, or of another size than the image;
-    InvalidArgument if the image or the mask is refused by its header.
+    Also reads its `mask`, and its EXIF if there are no intrinsics, which is a FieldError where they are needed.
+    FieldError if they are out of range, or of another size than the image; InvalidArgument if the image or the mask is
+    refused by its header.
     """
-    if not message.HasField("intrinsics"):
+    has_intrinsics = message.HasField("intrinsics")
+    if has_intrinsics:
+        camera = camera_from_message(message.intrinsics, joined(path, "intrinsics"))
+    elif needs_intrinsics:
         raise FieldError(joined(path, "intrinsics"), "is required")
-    camera = camera_from_message(message.intrinsics, joined(path, "intrinsics"))
     image = message.image  # every access copies the bytes
     width_px, height_px = image_size(image, limits, joined(path, "image"))
+    if not has_intrinsics:
+        camera = Camera.centred(width_px, height_px, float(max(width_px, height_px)))
+        return Photo(image, camera, joined(path, "image"), _mask_of(message, path, camera, limits), read_exif(image))
     if (camera.width_px, camera.height_px) != (width_px, height_px):
         raise FieldError(
             joined(path, "intrinsics.width_px"),
@@ -135,11 +142,16 @@ def photo_from_message(message: Any, path: str, limits: ImageLimits) -> Photo:
             f"must show the image: with {coefficients} only {100 * share:.0f} % of its pixels have a ray "
             f"({100 * MIN_SEEN_SHARE:.0f} are needed)",
         )
-    mask = b""
-    if message.HasField("mask"):
-        mask = message.mask
-        check_mask(mask, (width_px, height_px), limits, joined(path, "mask"))
-    return Photo(image, camera, joined(path, "image"), mask)
+    return Photo(image, camera, joined(path, "image"), _mask_of(message, path, camera, limits))
+
+
+def _mask_of(message: Any, path: str, camera: Camera, limits: ImageLimits) -> bytes:
+    """Reads the mask of a message, empty for none; InvalidArgument if it is refused by its header."""
+    if not message.HasField("mask"):
+        return b""
+    mask: bytes = message.mask
+    check_mask(mask, (camera.width_px, camera.height_px), limits, joined(path, "mask"))
+    return mask
 
 
 MIN_SEEN_SHARE = 0.1
@@ -165,7 +177,7 @@ def query_from_message(
     check_capture_time(request)
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
     narrowing, priors = priors_from_message(request, attributes)
-    photo = photo_from_message(request, "", engine.image_limits)
+    photo = photo_from_message(request, "", engine.image_limits, needs_intrinsics=False)
     return Query(
         scene_key=key_of(tenant, scene_id),
         reference_ids=reference_ids_from_names(request.references, scene_id, most),
@@ -194,6 +206,8 @@ def _sigma_from(request: pb.LocalizeRequest, photo: Photo) -> IntrinsicsSigma | 
     """Reads standard deviations of the intrinsics; None for the defaults. FieldError names a wrong field."""
     if not request.HasField("intrinsics_uncertainty"):
         return None
+    if photo.exif is not None:
+        raise FieldError("intrinsics_uncertainty", "is that of intrinsics, and there are none")
     message, camera, defaults = request.intrinsics_uncertainty, photo.camera, IntrinsicsSigma()
 
     def share(name: str, default: float, whole: float) -> float:

@@ -1,0 +1,220 @@
+"""The camera of a photograph that came without intrinsics, from its matches with the references.
+
+What is known without the matches are guesses, in order: by EXIF (`engine.cameras`); then the camera of references whose
+photographs have the same sides; then the series of pinholes with square pixels, a centred principal point and focal
+lengths of a geometric series. For each a pose is found from the matches with triangulated points (P3P in RANSAC), or,
+where these are few, from those with single references, too; the score of `pose.relative` compares them, as it does
+cameras that may be wrong (`judge.cameras`). The first one is taken that no other scores significantly higher than. Then
+pose and focal length together minimize
+
+    sum_i rho(|u_i - pi(f, P, X_i)|^2) + w (ln f - ln f_0)^2 / sigma^2,    rho(s) = c^2 log(1 + s / c^2)
+
+with the guess's standard deviation sigma. A camera of references stays as it is unless this differs from it by more
+than chance.
+
+From then on everything is as for intrinsics that were given with this standard deviation: the adjustment finds how much
+the matches determine, and of a flat wall that is little. That the references' camera fits makes the pose more accurate,
+but no more certain: another camera may have the same sides, and a focal length that the photograph does not tell apart.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera, RigidTransform, normalize
+
+from .bundle.adjust import LEAST_MATCHES
+from .bundle.intrinsics import DOUBTED_SIGMAS, read_as
+from .bundle.pose_problem import AdjustOptions
+from .bundle.priors import IntrinsicsSigma
+from .bundle.significance import is_significant, sigmas_of_gains
+from .features.limits import INEXACT_INLIER_PX
+from .features.views import PosedView, View
+from .judge.cameras import BY_POINTS, LINES, PNP
+from .optim.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize, perturbed, pose_jacobian
+from .options import ChosenCamera, IntrinsicsSource
+from .pairs.correspond import Correspondences
+from .pose.pnp import MIN_MATCHES, ransac
+from .pose.relative import Evidence, find_pose, scores_by_keypoint
+from .pose.two_view_matches import TwoViewMatches
+from .structure.match import vote
+from .structure.structure import StructureOptions, triangulated_structure
+
+UNKNOWN = IntrinsicsSigma(0.3, 0.01, 0.05)
+"""Standard deviations of a camera of which nothing is known: focal lengths of most cameras are within a third of one
+another, principal points within 2 % of the width of the centre, and lenses that are not corrected bend the edge by some
+per cent."""
+
+STEPS = MinimizeOptions(AdjustOptions.iterations, AdjustOptions.min_decrease)
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """A camera with the best pose that was found, None if none was, and its scores (F,) by keypoint."""
+
+    guess: ChosenCamera
+    pose: RigidTransform | None
+    scores: Array
+
+    @property
+    def total(self) -> float:
+        return float(self.scores.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class _Matches:
+    """The matches of a photograph whose keypoints are as the image shows them, with lens distortion."""
+
+    view: View
+    references: Sequence[PosedView]
+    lines: TwoViewMatches
+    x_in_world: Array
+    keypoint: NDArray[np.intp]
+
+    @staticmethod
+    def of(view: View, references: Sequence[PosedView], correspondences: Correspondences) -> "_Matches":
+        structure = triangulated_structure(references, correspondences, StructureOptions())
+        matches = vote(structure, [len(it.view.features) for it in references], correspondences)
+        lines = TwoViewMatches.of(view, references, correspondences.query_matches)
+        return _Matches(view, references, lines, structure.x_in_world[matches.point], matches.keypoint)
+
+    def evidence(self, camera: Camera) -> Evidence:
+        """The matches as read with a camera; without keypoints that it does not see."""
+        view = read_as(self.view, camera)
+        seen = np.asarray(np.isfinite(view.features.keypoints).all(axis=1))
+        lines, points = self.lines.read_as(view), seen[self.keypoint]
+        return Evidence(
+            view, self.references, lines[seen[lines.keypoint]], self.x_in_world[points], self.keypoint[points]
+        )
+
+    def scored(self, guess: ChosenCamera) -> _Scored:
+        """A camera with the best pose that a brief search finds."""
+        evidence, pose = self.evidence(guess.camera), None
+        if len(self.x_in_world) < LEAST_MATCHES:
+            pose = find_pose(evidence, LINES)
+        elif len(evidence.x_in_world) >= MIN_MATCHES:  # through a strong lens few may be seen
+            pose = ransac(evidence.points, None, PNP)
+        none = np.zeros(len(self.view.features))
+        return _Scored(guess, pose, none if pose is None else scores_by_keypoint(evidence, pose))
+
+
+def choose_camera(
+    view: View, references: Sequence[PosedView], correspondences: Correspondences, guesses: Sequence[ChosenCamera]
+) -> ChosenCamera | None:
+    """The camera of a photograph without intrinsics; None if its matches show none.
+
+    Args:
+        view: the photograph, read as a pinhole's; its camera gives the raster alone.
+        references: posed references.
+        correspondences: matches between all of them.
+        guesses: cameras that it may have by its EXIF, the likeliest first, in pixels of the view.
+    """
+    if len(references) < 2:
+        return guesses[0] if guesses else None
+    matches = _Matches.of(view, references, correspondences)
+    known = [matches.scored(it) for it in (*guesses, *_of_references(view, references))]
+    options = [*known, *map(matches.scored, _series(view.camera))]
+    best = max(options, key=lambda it: it.total)
+    if best.pose is None:
+        return None
+    found = next(it for it in options if not is_significant(sigmas_of_gains(best.scores - it.scores), len(options)))
+    improved, sigmas = _improved(matches, found)
+    if found.guess.source is not IntrinsicsSource.SCENE_CAMERA:
+        return improved
+    return found.guess if sigmas < DOUBTED_SIGMAS else replace(improved, source=IntrinsicsSource.ESTIMATED)
+
+
+def _of_references(view: View, references: Sequence[PosedView]) -> Sequence[ChosenCamera]:
+    """The camera of references whose photographs have the same sides: that of the median focal length."""
+    raster, cameras = view.camera, list[Camera]()
+    for it in references:
+        camera = it.view.photograph.camera if it.view.photograph else it.view.camera
+        if abs(camera.width_px * raster.height_px - raster.width_px * camera.height_px) <= camera.width_px:
+            cameras.append(camera.resized(raster.width_px, raster.height_px))
+    cameras.sort(key=lambda it: it.focal_x_px)
+    return [ChosenCamera(it, UNKNOWN, IntrinsicsSource.SCENE_CAMERA) for it in cameras[len(cameras) // 2 :][:1]]
+
+
+def _series(camera: Camera) -> Iterator[ChosenCamera]:
+    """Pinholes with focal lengths of 0.4 to 6 longer sides (100 to 10 degrees): first the usual 1.2, then near it."""
+    width_px, height_px = camera.width_px, camera.height_px
+    for step in sorted(range(-BY_POINTS.focal, 2 * BY_POINTS.focal + 1), key=lambda it: abs(it - 1)):
+        centred = Camera.centred(width_px, height_px, max(width_px, height_px) * 2.0 ** (step / BY_POINTS.per_octave))
+        yield ChosenCamera(centred, UNKNOWN, IntrinsicsSource.ESTIMATED)
+
+
+def _improved(matches: _Matches, found: _Scored) -> tuple[ChosenCamera, float]:
+    """The camera with the most probable focal length, by the points that are near at the pose that was found.
+
+    Also by how many standard deviations that differs; 0 and the camera itself where the points are too few.
+    """
+    camera, sigma, pose = found.guess.camera, found.guess.sigma.focal_share, found.pose
+    if pose is None:
+        return found.guess, 0.0
+    log_ratio, sigmas = 0.0, 0.0
+    for _ in range(2):  # which points are near at a pose of a camera that is a step off
+        better = replace(found.guess, camera=scaled(camera, log_ratio))
+        evidence = matches.evidence(better.camera)
+        near = np.nan_to_num(evidence.points.errors_px(pose), nan=np.inf) < INEXACT_INLIER_PX
+        if near.sum() < LEAST_MATCHES:
+            return better, sigmas
+        pixels = matches.view.features.pixels(evidence.keypoint[near])
+        problem = _Focal(camera, pixels, evidence.x_in_world[near], sigma)
+        log_ratio, camera_from_world = minimize(problem, (log_ratio, pose.inverse()), STEPS)
+        variance = np.linalg.pinv(problem.linearize((log_ratio, camera_from_world))[0], hermitian=True)[6, 6]
+        pose, sigmas = camera_from_world.inverse(), abs(log_ratio) / (AdjustOptions.error_inflation * np.sqrt(variance))
+    return replace(found.guess, camera=scaled(camera, log_ratio)), float(sigmas)
+
+
+def scaled(camera: Camera, log_ratio: float) -> Camera:
+    """The camera with other focal lengths, by the logarithm of their ratio to its own."""
+    ratio = float(np.exp(log_ratio))
+    return replace(camera, focal_x_px=ratio * camera.focal_x_px, focal_y_px=ratio * camera.focal_y_px)
+
+
+@dataclass(frozen=True, eq=False)
+class _Focal:
+    """The cost and its derivatives by the pose and the logarithm of the focal length; see `optimize.Problem`.
+
+    A point is its logarithm by that of the camera, and camera_from_world. Pixels (N, 2) are as the image shows them.
+    """
+
+    camera: Camera
+    pixels: Array
+    x_in_world: Array
+    sigma: float
+
+    def cost(self, x: tuple[float, RigidTransform]) -> float:
+        """Cost at a point; NaN if a point in the world is behind the camera."""
+        log_ratio, camera_from_world = x
+        residual = scaled(self.camera, log_ratio).project(camera_from_world.apply(self.x_in_world)) - self.pixels
+        prior = AdjustOptions.error_inflation**2 * (log_ratio / self.sigma) ** 2
+        return cauchy_cost((residual**2).sum(axis=1), AdjustOptions.loss_scale_sigma) + prior
+
+    def linearize(self, x: tuple[float, RigidTransform]) -> tuple[Array, Array]:
+        """Half the cost's information (7, 7) and gradient (7,): of the left perturbation, and of the logarithm."""
+        log_ratio, camera_from_world = x
+        camera, x_in_camera = scaled(self.camera, log_ratio), camera_from_world.apply(self.x_in_world)
+        projected = camera.project(x_in_camera)
+        residual = projected - self.pixels
+        by_pose = np.moveaxis(pose_jacobian(camera.pinhole(), x_in_camera), -1, 0)
+        if camera.distortion is not None:
+            by_pose = camera.distortion.by_ideal(normalize(x_in_camera)) @ by_pose
+        by_focal = projected - (camera.principal_x_px, camera.principal_y_px)
+        jacobian = np.concatenate([by_pose, by_focal[:, :, None]], axis=2)
+        weight = cauchy_weight((residual**2).sum(axis=1), AdjustOptions.loss_scale_sigma)
+        information = np.einsum("n,nai,naj->ij", weight, jacobian, jacobian)
+        gradient = np.einsum("n,nai,na->i", weight, jacobian, residual)
+        prior = AdjustOptions.error_inflation**2 / self.sigma**2
+        information[6, 6] += prior
+        gradient[6] += prior * log_ratio
+        return information, gradient
+
+    def step(
+        self, x: tuple[float, RigidTransform], equations: tuple[Array, Array], damping: float
+    ) -> tuple[float, RigidTransform] | None:
+        """The point after a step; None where it is not determined."""
+        step = damped_step(*equations, damping)
+        return None if step is None else (x[0] + float(step[6]), perturbed(x[1], step[:6]))
