@@ -58,7 +58,7 @@ def test_a_finding_ends_the_campaign_and_is_kept(tmp_path: Path, monkeypatch: py
         "def check(data):\n    assert b'bad' not in data, 'a law'\n    return True\n"
         "TARGET = Target(lambda: [b'good', b'this is bad'], check, lambda data, random, mutate: mutate(data))\n"
     )
-    monkeypatch.setattr(campaign, "TESTS", tmp_path)
+    monkeypatch.setattr(campaign, "ROOT", tmp_path)
     outcome = campaign.fuzz("images", tmp_path / "output", RUNS, SEED, LIMIT_S)
     (finding,) = outcome.findings
     assert Path(finding).read_bytes() == b"this is bad"

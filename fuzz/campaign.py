@@ -20,7 +20,9 @@ from pathlib import Path
 from . import folders
 from .target import TARGETS
 
-TESTS = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[1]
+_SUPPORT = ROOT / "tests"
+"""Where the package `support` is, which targets use."""
 _FINDINGS = ("crash-*", "timeout-*", "oom-*", "leak-*")
 _ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
@@ -72,12 +74,13 @@ def fuzz(target: str, output: Path, runs: int, seed: int, limit_s: float | None 
         old.unlink()
     (folder / "counts.json").unlink(missing_ok=True)
     arguments = [target, "--output", str(folder.resolve()), "--runs", str(runs), "--seed", str(seed)]
+    path = os.pathsep.join(filter(None, (str(_SUPPORT), os.environ.get("PYTHONPATH"))))
     begin_s = time.monotonic()
     with (folder / "log").open("wb") as log, tempfile.TemporaryDirectory(prefix="fuzz-", dir=folders.memory()) as place:
         ended = subprocess.run(
             [sys.executable, "-m", "fuzz.run", *arguments],
-            cwd=TESTS,
-            env={**os.environ, **_ENVIRONMENT, folders.MEMORY_VARIABLE: place},
+            cwd=ROOT,
+            env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": path, folders.MEMORY_VARIABLE: place},
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=subprocess.STDOUT,
