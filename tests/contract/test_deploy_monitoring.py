@@ -9,8 +9,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
 
 import promql_parser
@@ -41,33 +40,6 @@ TARGET_LABELS = {"job": "mapless", "instance": "a:9464", "namespace": "mapless",
 Labels = dict[str, str]
 
 
-@dataclass
-class Series:
-    """What Prometheus has of a server to which everything happened once: labels by name."""
-
-    by_name: dict[str, list[Labels]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        for family in everything_happened().registry.collect():
-            for sample in family.samples:
-                self.by_name.setdefault(sample.name, []).append({**sample.labels, **TARGET_LABELS})
-        self.by_name["up"] = [TARGET_LABELS]
-        for name in RECORDED:
-            self.by_name[name] = [{}]
-
-    def found_by(self, selector: promql_parser.VectorSelector) -> list[Labels]:
-        return [labels for labels in self.by_name.get(selector.name or "", ()) if self._fits(labels, selector)]
-
-    def _fits(self, labels: Mapping[str, str], selector: promql_parser.VectorSelector) -> bool:
-        return all(self._matches(labels.get(m.name, ""), m) for m in selector.matchers.matchers)
-
-    def _matches(self, value: str, matcher: promql_parser.Matcher) -> bool:
-        operator = promql_parser.MatchOp
-        if matcher.op in (operator.Equal, operator.NotEqual):
-            return (value == matcher.value) is (matcher.op == operator.Equal)
-        return (re.fullmatch(matcher.value, value) is not None) is (matcher.op == operator.Re)
-
-
 def everything_happened() -> Metrics:
     """Metrics with a series of everything; those with labels of ours exist from the start."""
     metrics = Metrics()
@@ -93,7 +65,27 @@ def everything_happened() -> Metrics:
     return metrics
 
 
-SERIES = Series()
+def series() -> dict[str, list[Labels]]:
+    """What Prometheus has of a server to which everything happened once: labels by name."""
+    found: dict[str, list[Labels]] = {"up": [TARGET_LABELS]} | {name: [{}] for name in RECORDED}
+    for family in everything_happened().registry.collect():
+        for sample in family.samples:
+            found.setdefault(sample.name, []).append({**sample.labels, **TARGET_LABELS})
+    return found
+
+
+SERIES = series()
+
+
+def found_by(selector: promql_parser.VectorSelector) -> list[Labels]:
+    def fits(value: str, matcher: promql_parser.Matcher) -> bool:
+        operator = promql_parser.MatchOp
+        if matcher.op in (operator.Equal, operator.NotEqual):
+            return (value == matcher.value) is (matcher.op == operator.Equal)
+        return (re.fullmatch(matcher.value, value) is not None) is (matcher.op == operator.Re)
+
+    known, matchers = SERIES.get(selector.name or "", ()), selector.matchers.matchers
+    return [labels for labels in known if all(fits(labels.get(it.name, ""), it) for it in matchers)]
 
 
 def expressions() -> Iterator[tuple[str, str]]:
@@ -126,11 +118,11 @@ def test_series_values_and_labels_that_are_asked_for_exist(where: str, expressio
     assert selectors(expression)
     labels_there = set()
     for selector in selectors(expression):
-        found = SERIES.found_by(selector)
+        found = found_by(selector)
         assert found, f"nothing is {selector}"
         labels_there |= {name for labels in found for name in labels}
         for matcher in selector.matchers.matchers:
-            values = {labels.get(matcher.name, "") for labels in SERIES.by_name[selector.name or ""]} | {"UNKNOWN"}
+            values = {labels.get(matcher.name, "") for labels in SERIES[selector.name or ""]} | {"UNKNOWN"}
             for alternative in matcher.value.split("|"):
                 assert any(re.fullmatch(alternative, it) for it in values), f"{matcher.name} is never {alternative}"
     for node in nodes(expression):
@@ -205,7 +197,7 @@ def test_grafana_is_given_what_the_dashboard_wants() -> None:
     assert used - {"__rate_interval"} == set(variables)
     for name in ("job", "instance"):
         (metric,) = re.findall(r"label_values\((\w+)", variables[name]["query"])
-        assert metric in SERIES.by_name
+        assert metric in SERIES
     provisioning = DEPLOY / "grafana" / "provisioning"
     (source,) = yaml.safe_load((provisioning / "datasources/prometheus.yaml").read_text())["datasources"]
     (provider,) = yaml.safe_load((provisioning / "dashboards/mapless.yaml").read_text())["providers"]
@@ -234,8 +226,8 @@ def test_prometheus_asks_the_server_where_it_answers() -> None:
 def test_the_adapter_asks_for_what_is_scaled_by() -> None:
     (rule,) = yaml.safe_load((DEPLOY / "prometheus/adapter-rules.yaml").read_text())["rules"]
     (found,) = selectors(rule["seriesQuery"])
-    assert SERIES.found_by(found)
+    assert found_by(found)
     assert set(rule["resources"]["overrides"]) <= set(TARGET_LABELS)
     query = rule["metricsQuery"].replace("<<.GroupBy>>", "pod").replace("<<.Series>>", found.name or "")
     (selector,) = selectors(query.replace("<<.LabelMatchers>>", 'namespace="mapless",pod=~"mapless-0"'))
-    assert {labels["stage"] for labels in SERIES.found_by(selector)} == set(STAGES)
+    assert {labels["stage"] for labels in found_by(selector)} == set(STAGES)

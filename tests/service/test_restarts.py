@@ -58,7 +58,7 @@ def calling(
                 except MaplessError as error:
                     failed.append(error)
                 took_s.append(time.monotonic() - start_s)
-                if stop.wait(0.01) or failed:
+                if stop.wait(0.05) or failed:
                     return
 
     threads = [threading.Thread(target=repeat, args=(call,)) for call in calls]
