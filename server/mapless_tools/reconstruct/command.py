@@ -7,7 +7,12 @@ from typing import Annotated
 
 import typer
 
+from mapless_tools.connection import with_flags
 
+from .world.flags import WorldFlags
+
+
+@with_flags
 def reconstruct_command(
     paths: Annotated[
         list[Path],
@@ -28,6 +33,8 @@ def reconstruct_command(
     ] = None,
     part: Annotated[int, typer.Option(help="Which part to write, if the photographs show several places.")] = 1,
     features: Annotated[str, typer.Option(help="Local features, as the setting of the server names them.")] = "auto",
+    *,
+    world: WorldFlags,
 ) -> None:
     """Compute the poses of videos and photographs that have none, and write them to a folder that can be imported.
 
@@ -40,14 +47,16 @@ def reconstruct_command(
 
     from .cameras import LensOptions
     from .output import REPORT, printed, write_folder
-    from .run import ReconstructOptions, prepare, read_photographs, reconstruct
+    from .run import ReconstructOptions, prepare, reconstruct
+    from .sources import SourceOptions, read_sources
 
     with failures_end_command(ValueError, interrupted="interrupted; run it again to go on"):
         *sources, out = paths
-        options = ReconstructOptions(part=part, features=features, lens=LensOptions.of(lens or ()))
+        wanted = SourceOptions(frames=frames, excluded=(out,))
+        options = ReconstructOptions(part, features, LensOptions.of(lens or ()), world.options())
         with terminable(), progress_bars() as progress:
             work = prepare(sources, out)
-            pictures = read_photographs(sources)
+            pictures = read_sources(sources, work / "pictures", wanted, progress)
             result = reconstruct(pictures, work, options, progress)
             write_folder(result, work, out, progress)
     print("\n".join(printed(result)))

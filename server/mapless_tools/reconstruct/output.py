@@ -68,7 +68,13 @@ def file_name(posed: PosedPicture) -> str:
 
 def _scene(folder: Path, world: WorldFrame, count: int) -> KnownScene:
     return KnownScene(
-        folder.name, 0, count, datetime.now(UTC), down_in_world=world.down_in_world, arbitrary_unit=not world.is_metric
+        folder.name,
+        0,
+        count,
+        datetime.now(UTC),
+        datum=world.datum,
+        down_in_world=world.down_in_world,
+        arbitrary_unit=not world.is_metric,
     )
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,13 +17,10 @@ from pathlib import Path
 import pycolmap
 
 from mapless_server.choices import AUTO
-from mapless_server.images import ANY_SIZE, image_size
-from mapless_server.images.exif import read_exif
 from mapless_server.method.features.matching import OPTIONS, fastest_arithmetic
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.serve.assembly import make_first_features
 from mapless_server.settings import available_cores, load_settings
-from mapless_tools.dataset import IMAGE_ENDINGS, legal_id
 from mapless_tools.progress import Progress
 
 from .cameras import LensOptions, StartingCamera, starting_cameras
@@ -32,6 +28,8 @@ from .features import FeatureFolder
 from .mapping import FEWEST, map_photographs, omitted, read_parts, why_no_part
 from .matching import MatchFolder, PairOptions, pairs_of, verify, write_database
 from .pictures import Omitted, Part, Picture, Pictures, WorldFrame
+from .world.options import WorldOptions
+from .world.placing import place
 
 WORK = ".work"
 
@@ -48,6 +46,7 @@ class ReconstructOptions:
     part: int = 1
     features: str = AUTO
     lens: LensOptions = field(default_factory=LensOptions)
+    world: WorldOptions = field(default_factory=WorldOptions)
     pairs: PairOptions = field(default_factory=PairOptions)
 
     def __post_init__(self) -> None:
@@ -92,7 +91,7 @@ def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, pro
         raise ValueError(f"there is no part {options.part}: the photographs give {len(parts)}")
     part = parts[options.part - 1]
     left_out = (*pictures.omitted, *omitted(part, parts, chosen, database))
-    placed, world = _placed(part)
+    placed, world = place(part, options.world, progress)
     return Reconstructed(placed, world, cameras, tuple(len(it.posed) for it in parts), left_out, pictures.notes)
 
 
@@ -162,19 +161,3 @@ def prepare(sources: Sequence[Path], out: Path) -> Path:
         raise ValueError(f"{out} is not empty, and not from an earlier run: name a folder that is not there")
     work.mkdir(parents=True, exist_ok=True)
     return work
-
-
-def read_photographs(sources: Sequence[Path]) -> Pictures:
-    """The photographs of folders."""
-    files = [it for source in sources for it in (sorted(source.iterdir()) if source.is_dir() else [source])]
-    chosen: dict[str, Picture] = {}
-    for file in files:
-        if file.suffix.lower() in IMAGE_ENDINGS:
-            data = file.read_bytes()
-            name = legal_id(file.stem, chosen)
-            chosen[name] = Picture(name, file, *image_size(data, ANY_SIZE), file, read_exif(data))
-    return Pictures(tuple(chosen.values()))
-
-
-def _placed(part: Part) -> tuple[Part, WorldFrame]:
-    return part, WorldFrame(False, math.inf, None, ())

@@ -17,9 +17,9 @@ from mapless_tools.reconstruct.run import (
     Reconstructed,
     ReconstructOptions,
     prepare,
-    read_photographs,
     reconstruct,
 )
+from mapless_tools.reconstruct.sources import SourceOptions, read_sources
 
 OPTIONS = ReconstructOptions(features="sift")
 
@@ -36,7 +36,8 @@ def photographs(folder: Path, chosen: Sequence[Photograph]) -> Path:
 
 
 def reconstructed(source: Path, out: Path, options: ReconstructOptions = OPTIONS) -> Reconstructed:
-    return reconstruct(read_photographs([source]), prepare([source], out), options, silent)
+    work = prepare([source], out)
+    return reconstruct(read_sources([source], work / "pictures", SourceOptions(), silent), work, options, silent)
 
 
 def errors(result: Reconstructed, truth: Sequence[Photograph]) -> Array:

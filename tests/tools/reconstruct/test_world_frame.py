@@ -16,8 +16,8 @@ from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.images.exif import Exif, GpsPosition
 from mapless_tools.ingest.command import DISTANCE_SEPARATOR
 from mapless_tools.reconstruct.pictures import Part, WorldFrame
-from mapless_tools.reconstruct.world import WorldFlags
 from mapless_tools.reconstruct.world.down import DOWN_OF_ORIENTATION
+from mapless_tools.reconstruct.world.flags import WorldFlags
 from mapless_tools.reconstruct.world.placing import place
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)

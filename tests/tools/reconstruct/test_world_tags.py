@@ -15,8 +15,7 @@ from mapless_tools.dataset import Frame
 from mapless_tools.demo.photographs import ROOM
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.reconstruct.pictures import Part, WorldFrame
-from mapless_tools.reconstruct.world import WorldFlags
-from mapless_tools.reconstruct.world.options import FAMILIES
+from mapless_tools.reconstruct.world.options import FAMILIES, WorldFlags
 from mapless_tools.reconstruct.world.placing import place
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)

@@ -3,8 +3,3 @@
 May import `reconstruct.pictures`, the server's rooms, and the layouts and fits of `ingest`. Begin with `placing.place`,
 then `tags` and `squares`, `gps`, `down`; `flags` are those of commands.
 """
-
-from .flags import WorldFlags
-from .options import WorldOptions
-
-__all__ = ["WorldFlags", "WorldOptions"]
