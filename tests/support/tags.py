@@ -60,7 +60,8 @@ def photographed(
     posed = []
     for i, pose in enumerate(poses):
         noise = generator.integers(90, 130, (camera.height_px // 8, camera.width_px // 8, 3)).astype(np.uint8)
-        image = cv2.resize(noise, (camera.width_px, camera.height_px), interpolation=cv2.INTER_CUBIC)
+        size = (camera.width_px, camera.height_px)
+        image: Image = np.asarray(cv2.resize(noise, size, interpolation=cv2.INTER_CUBIC), np.uint8)
         for tag in tags:
             image = tag.paint(image, camera, pose)
         posed.append(posed_picture(folder, f"photo-{i}", image, camera, pose))

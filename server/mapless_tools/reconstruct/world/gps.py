@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
 
 from mapless.geodesy import GeoPosition, ecef_from_enu_at, ecef_from_geodetic, geodetic_from_ecef
 from mapless.geometry import Array, Similarity, rotation_from_vector
@@ -20,6 +20,7 @@ from mapless_tools.ingest.metres import umeyama
 
 from ..pictures import Part
 from .down import Down
+from .fitting import least
 from .scales import ScaleEstimate
 
 EXTENT_RATIO = 10.0
@@ -50,7 +51,7 @@ class Fixes:
     """Positions of photographs, by index: east, north, up (N, 3) metres at `place`; up is NaN where it is missing."""
 
     place: GeoPosition
-    photographs: Array
+    photographs: NDArray[np.integer]
     x_in_enu: Array
     sigma_m: Array
     has_accuracy: bool
@@ -66,7 +67,7 @@ class Fixes:
         from_middle_m = np.linalg.norm(self.x_in_enu[:, :2], axis=1)
         return bool(np.quantile(from_middle_m, 0.9) <= BOUND_SIGMAS * self.accuracy_m)
 
-    def of(self, chosen: Array) -> "Fixes":
+    def of(self, chosen: NDArray[np.bool_]) -> "Fixes":
         """Those that are chosen."""
         return replace(
             self,
@@ -145,7 +146,7 @@ def fit_gps(part: Part, fixes: Fixes, down: Down | None, scale: ScaleEstimate | 
     found, use = best
     for _ in range(2):
         found, _ = _solved(centres[use], fixes.of(use), found, down, scale)
-        use = _off(found.apply(centres), fixes) <= BOUND_SIGMAS
+        use = np.asarray(_off(found.apply(centres), fixes) <= BOUND_SIGMAS)
         if use.sum() < MIN_FIXES:
             return None
     across_m = np.linalg.norm((found.apply(centres) - fixes.x_in_enu)[use, :2], axis=1)
@@ -181,7 +182,7 @@ def _is_nowhere(position: GpsPosition) -> bool:
     return max(abs(position.latitude_deg), abs(position.longitude_deg)) < NOWHERE_DEG
 
 
-def _agreeing(centres: Array, fixes: Fixes, down: Down | None) -> tuple[Similarity, Array] | None:
+def _agreeing(centres: Array, fixes: Fixes, down: Down | None) -> tuple[Similarity, NDArray[np.bool_]] | None:
     """The sample's similarity with which most positions agree, and which these are; None if they are not most."""
     generator = np.random.default_rng(0)
     best, least = None, (len(centres) // 2, 0.0)
@@ -199,7 +200,7 @@ def _agreeing(centres: Array, fixes: Fixes, down: Down | None) -> tuple[Similari
         if not found.scale > 0:
             continue
         off = _off(_with_height(found, centres, fixes), fixes)
-        use = off <= BOUND_SIGMAS
+        use = np.asarray(off <= BOUND_SIGMAS)
         score = (int(use.sum()), -float(off[use].sum()))
         if score > least:
             shift = _with_height(found, centres, fixes)[0] - found.apply(centres[0])
@@ -252,8 +253,8 @@ def _solved(
     first = np.zeros(7)
     if scale is not None:
         first[0] = math.log(scale.metres_per_unit / start.scale)
-    found = least_squares(residuals, first)
-    return similarity(found.x), np.asarray(found.jac)
+    change, jacobian = least(residuals, first)
+    return similarity(change), jacobian
 
 
 def _fit(found: Similarity, jacobian: Array, x_in_enu: Array, scatter_m: float, false: tuple[int, ...]) -> GpsFit:

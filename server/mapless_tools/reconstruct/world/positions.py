@@ -73,7 +73,7 @@ def _positions(source: Path) -> tuple[dict[str, Array], Array | None]:
 
 def _axis(name: str) -> Array:
     sign = -1.0 if name.startswith("-") else 1.0
-    return sign * np.eye(3)[AXES.index(name) % 3]
+    return np.asarray(sign * np.eye(3)[AXES.index(name) % 3])
 
 
 def _tilt_sigma_deg(pairs: dict[str, tuple[Array, Array]], fit: MetreFit) -> float:

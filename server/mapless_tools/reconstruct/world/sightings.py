@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mapless.geometry import Array
 from mapless_server.errors import InvalidArgument
@@ -52,7 +53,7 @@ def sightings(
     return {tag: tuple(all_of) for tag, all_of in found.items()}
 
 
-def _grey(posed: PosedPicture) -> Array:
+def _grey(posed: PosedPicture) -> NDArray[np.uint8]:
     picture = posed.picture
     try:
         pixels = decode_image(picture.path.read_bytes(), ANY_SIZE)
@@ -63,7 +64,7 @@ def _grey(posed: PosedPicture) -> Array:
         raise ValueError(
             f"{picture.path} has {size} pixels, its camera {posed.camera.width_px}x{posed.camera.height_px}"
         )
-    return cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _detector(family: str) -> cv2.aruco.ArucoDetector:

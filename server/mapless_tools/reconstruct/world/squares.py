@@ -10,12 +10,13 @@ from dataclasses import dataclass, fields
 from itertools import combinations
 
 import numpy as np
-from scipy.optimize import least_squares
+from numpy.typing import NDArray
 
 from mapless.geometry import Array, Similarity, normalize
 from mapless_tools.ingest.metres import umeyama
 
 from ..pictures import PosedPicture
+from .fitting import least
 from .sightings import Sighting
 
 MIN_PHOTOGRAPHS = 3
@@ -56,7 +57,7 @@ class _Observed:
     `focal_px` (N,) turns slopes into pixels, `bound_px` (N,) is the largest error of a corner.
     """
 
-    photographs: Array
+    photographs: NDArray[np.integer]
     centres: Array
     camera_from_part: Array
     rays: Array
@@ -67,7 +68,7 @@ class _Observed:
     def __len__(self) -> int:
         return len(self.centres)
 
-    def __getitem__(self, chosen: Array) -> "_Observed":
+    def __getitem__(self, chosen: NDArray[np.integer]) -> "_Observed":
         return _Observed(**{it.name: getattr(self, it.name)[chosen] for it in fields(self)})
 
     def residuals_px(self, corners: Array) -> Array:
@@ -161,8 +162,8 @@ def _refined(seen: _Observed, corners: Array) -> Array:
     def residuals(shift: Array) -> Array:
         return np.asarray(seen.residuals_px(corners + scale * shift.reshape(4, 3)).ravel())
 
-    found = least_squares(residuals, np.zeros(12), loss="soft_l1", f_scale=ROBUST_PX)
-    return np.asarray(corners + scale * found.x.reshape(4, 3))
+    shift, _ = least(residuals, np.zeros(12), ROBUST_PX)
+    return np.asarray(corners + scale * shift.reshape(4, 3))
 
 
 def _square(seen: _Observed, sightings: Sequence[Sighting]) -> Square:
