@@ -35,7 +35,10 @@ Result = TypeVar("Result")
 
 
 def map_photographs(database: Path, folder: Path, count: int, threads: int, progress: Progress) -> None:
-    """Writes pycolmap's models of a database into a folder: 0, 1, ...; none if no photographs fit together."""
+    """Writes pycolmap's models of a database into a folder: 0, 1, ...; none if no photographs fit together.
+
+    The incremental mapper measures best; where it finds no beginning, the global one, which needs none, is tried.
+    """
     options = pycolmap.IncrementalPipelineOptions(
         min_model_size=FEWEST, extract_colors=False, num_threads=threads, random_seed=SEED
     )
@@ -55,10 +58,13 @@ def map_photographs(database: Path, folder: Path, count: int, threads: int, prog
         ),
         token.cancel,
     )
+    if not any(folder.iterdir()) and not _without_parallax(_verified(database)):
+        all_at_once = pycolmap.GlobalPipelineOptions(min_model_size=FEWEST, num_threads=threads, random_seed=SEED)
+        _interruptible(lambda: pycolmap.global_mapping(database, database.parent, folder, all_at_once))
     progress("poses", count, count)
 
 
-def _interruptible(work: Callable[[], Result], cancel: Callable[[], None]) -> Result:
+def _interruptible(work: Callable[[], Result], cancel: Callable[[], None] = lambda: None) -> Result:
     """The result of native code, which would not be interrupted by Ctrl-C."""
     results: list[Result] = []
     failures: list[BaseException] = []
@@ -92,15 +98,13 @@ def read_parts(folder: Path, pictures: Sequence[Picture], features: FeatureFolde
 
 def why_no_part(database: Path, folder: Path) -> str:
     """A sentence that says why no photographs of a database, with the models of a folder, got poses."""
-    with pycolmap.Database.open(database) as content:
-        verified = [it for it in content.read_two_view_geometries()[1] if len(it.inlier_matches) >= FEWEST_MATCHES]
+    verified = _verified(database)
     if not verified:
         return (
             "no two photographs show the same place clearly enough to be compared: take photographs that overlap by "
             "more than half, sharp and lit"
         )
-    turned = sum(int(it.config) in _NO_PARALLAX for it in verified)
-    if any(folder.iterdir()) or turned > len(verified) / 2:
+    if any(folder.iterdir()) or _without_parallax(verified):
         return (
             "the camera seems only to have turned: photographs differ as those from one place do, so that nothing "
             "shows how far it moved, or all show one flat surface; move the camera by a step between photographs"
@@ -108,6 +112,17 @@ def why_no_part(database: Path, folder: Path) -> str:
     return (
         "too few photographs fit together for poses: at least three must show the same place from different positions"
     )
+
+
+def _verified(database: Path) -> list[pycolmap.TwoViewGeometry]:
+    """The geometries of pairs that have one."""
+    with pycolmap.Database.open(database) as content:
+        return [it for it in content.read_two_view_geometries()[1] if len(it.inlier_matches) >= FEWEST_MATCHES]
+
+
+def _without_parallax(geometries: Sequence[pycolmap.TwoViewGeometry]) -> bool:
+    """Whether most pairs are explained by a turn of the camera, or by a plane, alone."""
+    return sum(int(it.config) in _NO_PARALLAX for it in geometries) > len(geometries) / 2
 
 
 def omitted(part: Part, parts: Sequence[Part], pictures: Sequence[Picture], database: Path) -> tuple[Omitted, ...]:

@@ -1,6 +1,7 @@
 """Photographs without poses get the poses that are known of them, or a sentence that says why not."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from mapless.geometry import Array
 from mapless_tools.demo.photographs import Photograph, room
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.metres import umeyama
+from mapless_tools.progress import Progress
 from mapless_tools.reconstruct.output import write_folder
 from mapless_tools.reconstruct.run import (
     Reconstructed,
@@ -31,13 +33,15 @@ def silent(step: str, done: int, total: int) -> None:
 def photographs(folder: Path, chosen: Sequence[Photograph]) -> Path:
     folder.mkdir()
     for it in chosen:
-        (folder / f"{it.name}.jpg").write_bytes(it.data)
+        (folder / f"{it.name}.png").write_bytes(it.data)
     return folder
 
 
-def reconstructed(source: Path, out: Path, options: ReconstructOptions = OPTIONS) -> Reconstructed:
+def reconstructed(
+    source: Path, out: Path, options: ReconstructOptions = OPTIONS, progress: Progress = silent
+) -> Reconstructed:
     work = prepare([source], out)
-    return reconstruct(read_sources([source], work / "pictures", SourceOptions(), silent), work, options, silent)
+    return reconstruct(read_sources([source], work / "pictures", SourceOptions(), silent), work, options, progress)
 
 
 def errors(result: Reconstructed, truth: Sequence[Photograph]) -> Array:
@@ -48,9 +52,18 @@ def errors(result: Reconstructed, truth: Sequence[Photograph]) -> Array:
     return np.asarray(np.linalg.norm(umeyama(found, wanted).apply(found) - wanted, axis=1))
 
 
+def half(it: Photograph, negative: bool = False) -> Photograph:
+    """The photograph at half its size; its negative shows another room, whose light and dark are exchanged."""
+    image = cv2.imdecode(np.frombuffer(it.data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    reduced = np.asarray(cv2.resize(image, (480, 360), interpolation=cv2.INTER_AREA), np.uint8)
+    name = f"negative-{it.name}" if negative else it.name
+    data = encode(".png", 255 - reduced if negative else reduced)
+    return Photograph(name, data, it.camera.resized(480, 360), it.world_from_camera)
+
+
 @pytest.fixture(scope="module")
 def chosen() -> Sequence[Photograph]:
-    return room().references[:7]
+    return [half(it) for it in room().references[:7]]
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +85,7 @@ def test_poses_are_those_of_the_rendered_room(result: Reconstructed, chosen: Seq
     assert len(result.part.posed) == len(chosen)
     assert not result.omitted
     assert np.median(errors(result, chosen)) < 0.02
-    assert [it.camera.focal_x_px for it in result.part.posed] == pytest.approx([816] * len(chosen), rel=0.03)
+    assert [it.camera.focal_x_px for it in result.part.posed] == pytest.approx([408] * len(chosen), rel=0.03)
 
 
 def test_folder_is_read_as_posed_photographs(result: Reconstructed, out: Path, chosen: Sequence[Photograph]) -> None:
@@ -84,6 +97,34 @@ def test_folder_is_read_as_posed_photographs(result: Reconstructed, out: Path, c
     assert (out / "scene.glb").read_bytes()[:4] == b"glTF"
 
 
+def test_interrupted_run_continues_to_the_same_poses(source: Path, tmp_path: Path, result: Reconstructed) -> None:
+    def interrupt(step: str, done: int, total: int) -> None:
+        if step == "matches" and done:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        reconstructed(source, out, progress=interrupt)
+    assert [it.name for it in out.iterdir()] == [".work"]
+    made = {it: it.stat().st_mtime_ns for it in (out / ".work").rglob("*.npz")}
+    again = reconstructed(source, out)
+    assert {it: it.stat().st_mtime_ns for it in made} == made
+    for one, other in zip(again.part.posed, result.part.posed, strict=True):
+        np.testing.assert_array_equal(one.world_from_camera.matrix(), other.world_from_camera.matrix())
+
+
+def test_two_places_become_two_parts(tmp_path: Path, chosen: Sequence[Photograph]) -> None:
+    others = [half(it, negative=True) for it in room().references[:4]]
+    source = photographs(tmp_path / "photos", [*chosen[:5], *others])
+    first = reconstructed(source, tmp_path / "out")
+    assert first.parts == (5, 4)
+    assert {it.reason for it in first.omitted} == {"it is in part 2"}
+    second = reconstructed(source, tmp_path / "out", replace(OPTIONS, part=2))
+    assert {it.picture.name for it in second.part.posed} == {it.name for it in others}
+    with pytest.raises(ValueError, match="there is no part 3"):
+        reconstructed(source, tmp_path / "out", replace(OPTIONS, part=3))
+
+
 def test_turning_camera_gets_no_poses(tmp_path: Path) -> None:
     chosen = room().references[0]
     image = cv2.imdecode(np.frombuffer(chosen.data, np.uint8), cv2.IMREAD_COLOR)
@@ -92,7 +133,7 @@ def test_turning_camera_gets_no_poses(tmp_path: Path) -> None:
     for degrees in range(-12, 13, 4):
         turn = cv2.Rodrigues(np.radians([degrees / 3, degrees, 0.0]))[0]
         part = cv2.warpPerspective(image, matrix @ turn @ np.linalg.inv(matrix), (960, 720))
-        data = encode(".jpg", part[150:570, 200:760])
+        data = encode(".png", part[150:570, 200:760])
         turned.append(Photograph(f"turned{degrees}", data, chosen.camera, chosen.world_from_camera))
     with pytest.raises(ValueError, match="only to have turned"):
         reconstructed(photographs(tmp_path / "photos", turned), tmp_path / "out")
