@@ -12,8 +12,11 @@ from .looking import Looked
 from .options import SourceOptions
 from .photographs import read_photographs
 from .remembered import Remembered
+from .videos import ChosenFrame, read_videos
 
 _LOG = "sources.jsonl"
+_STEM_CHARACTERS = 100
+"""Of a video's name in that of a frame, which is to have room for the frame's index."""
 
 
 def read_sources(sources: Sequence[Path], folder: Path, options: SourceOptions, progress: Progress) -> Pictures:
@@ -30,11 +33,12 @@ def read_sources(sources: Sequence[Path], folder: Path, options: SourceOptions, 
     _make_folder(folder)
     remembered = Remembered(folder / _LOG)
     photographs, omitted, notes = read_photographs(files.photographs, folder, options, remembered, progress)
-    omitted = [*files.omitted, *omitted]
-    chosen = _named(photographs)
+    frames, unused, said = read_videos(files.videos, files.photographs, folder, options, remembered, progress)
+    omitted = [*files.omitted, *omitted, *unused]
+    chosen = _named(photographs, frames)
     if not chosen:
         raise ValueError(_nothing(sources, omitted))
-    return Pictures(tuple(chosen), tuple(omitted), tuple(notes))
+    return Pictures(tuple(chosen), tuple(omitted), (*notes, *said))
 
 
 def _excluding(options: SourceOptions, folder: Path) -> SourceOptions:
@@ -49,13 +53,21 @@ def _make_folder(folder: Path) -> None:
         raise ValueError(f"{folder} cannot be written: {error.strerror}") from error
 
 
-def _named(photographs: Sequence[Looked]) -> list[Picture]:
+def _named(photographs: Sequence[Looked], frames: Sequence[ChosenFrame]) -> list[Picture]:
     names: set[str] = set()
-    pictures = []
-    for it in photographs:
-        name = legal_id(it.file.path.stem, names)
+
+    def legal(stem: str) -> str:
+        name = legal_id(stem, names)
         names.add(name)
-        pictures.append(Picture(name, it.path, it.width_px, it.height_px, it.file.path, it.exif))
+        return name
+
+    pictures = [
+        Picture(legal(it.file.path.stem), it.path, it.width_px, it.height_px, it.file.path, it.exif)
+        for it in photographs
+    ]
+    for it in frames:
+        name = legal(f"{it.file.path.stem[:_STEM_CHARACTERS]}_{it.time.frame:06d}")
+        pictures.append(Picture(name, it.path, it.width_px, it.height_px, it.file.path, time=it.time))
     return pictures
 
 
