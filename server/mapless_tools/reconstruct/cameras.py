@@ -44,7 +44,7 @@ class LensOptions:
     @staticmethod
     def of(texts: Sequence[str]) -> LensOptions:
         """Reads the values of --lens: `fisheye`, or files with the intrinsics of a camera; ValueError names one."""
-        return LensOptions(FISHEYE in texts, tuple(read_camera(it) for it in texts if it != FISHEYE))
+        return LensOptions(FISHEYE in texts, tuple(_calibrated(it) for it in texts if it != FISHEYE))
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,15 @@ class StartingCamera:
             params=parameters,
             has_prior_focal_length=self.has_focal,
         )
+
+
+def _calibrated(file: str) -> Camera:
+    try:
+        return read_camera(file)
+    except OSError as error:
+        raise ValueError(f"--lens {file}: must be {FISHEYE}, or a file with a camera: {error.strerror}") from error
+    except ValueError as error:
+        raise ValueError(f"--lens {error}") from error
 
 
 def from_colmap(camera: pycolmap.Camera) -> Camera:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import pycolmap
@@ -16,6 +14,7 @@ from mapless_tools.progress import Progress
 from .cameras import from_colmap
 from .features import FeatureFolder
 from .matching import SEED
+from .native import interruptible
 from .pictures import Omitted, Part, Picture, PosedPicture
 
 FEWEST = 3
@@ -31,7 +30,6 @@ _NO_PARALLAX = frozenset(
         pycolmap.TwoViewGeometryConfiguration.PLANAR_OR_PANORAMIC,
     )
 )
-Result = TypeVar("Result")
 
 
 def map_photographs(database: Path, folder: Path, count: int, threads: int, progress: Progress) -> None:
@@ -52,7 +50,7 @@ def map_photographs(database: Path, folder: Path, count: int, threads: int, prog
 
     progress("poses", 0, count)
     folder.mkdir()
-    _interruptible(
+    interruptible(
         lambda: pycolmap.incremental_mapping(
             database, database.parent, folder, options, next_image_callback=add, cancellation_token=token
         ),
@@ -60,32 +58,8 @@ def map_photographs(database: Path, folder: Path, count: int, threads: int, prog
     )
     if not any(folder.iterdir()) and not _without_parallax(_verified(database)):
         all_at_once = pycolmap.GlobalPipelineOptions(min_model_size=FEWEST, num_threads=threads, random_seed=SEED)
-        _interruptible(lambda: pycolmap.global_mapping(database, database.parent, folder, all_at_once))
+        interruptible(lambda: pycolmap.global_mapping(database, database.parent, folder, all_at_once))
     progress("poses", count, count)
-
-
-def _interruptible(work: Callable[[], Result], cancel: Callable[[], None] = lambda: None) -> Result:
-    """The result of native code, which would not be interrupted by Ctrl-C."""
-    results: list[Result] = []
-    failures: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            results.append(work())
-        except BaseException as failure:
-            failures.append(failure)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    try:
-        while thread.is_alive():
-            thread.join(0.1)
-    except BaseException:
-        cancel()
-        raise
-    if failures:
-        raise failures[0]
-    return results[0]
 
 
 def read_parts(folder: Path, pictures: Sequence[Picture], features: FeatureFolder) -> tuple[Part, ...]:

@@ -20,6 +20,7 @@ from mapless_tools.progress import Progress, tracked
 
 from .cameras import StartingCamera
 from .features import FeatureFolder, in_colmap_pixels
+from .native import interruptible
 
 SEED = 0
 _ITERATIONS = 100, 2000
@@ -136,6 +137,13 @@ def verify(file: Path, threads: int) -> None:
     """Finds the geometry of each pair of a database: essential matrix, homography or none."""
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = SEED
-    pycolmap.geometric_verification(
-        file, pycolmap.GeometricVerifierOptions(num_threads=threads), two_view_geometry_options=options
+    token = pycolmap.CancellationToken()
+    interruptible(
+        lambda: pycolmap.geometric_verification(
+            file,
+            pycolmap.GeometricVerifierOptions(num_threads=threads),
+            two_view_geometry_options=options,
+            cancellation_token=token,
+        ),
+        token.cancel,
     )

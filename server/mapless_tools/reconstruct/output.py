@@ -28,6 +28,8 @@ from .pictures import Part, PosedPicture, WorldFrame
 from .run import Reconstructed, made_once, remove
 
 REPORT, PICTURE = "report.html", "scene.glb"
+POINTS_ON_PLAN = 4000
+"""Evenly chosen ones: each takes a hundred bytes of the page."""
 
 
 def write_folder(result: Reconstructed, work: Path, out: Path, progress: Progress) -> None:
@@ -39,7 +41,7 @@ def write_folder(result: Reconstructed, work: Path, out: Path, progress: Progres
     remove(ready)
     with made_once(ready) as folder:
         assert folder is not None
-        _make(result, folder, progress)
+        _make(result, folder, out.name, progress)
     (out / FOLDER_FILE).unlink(missing_ok=True)
     for name in (IMAGES, REPORT, PICTURE, FOLDER_FILE):
         remove(out / name)
@@ -47,16 +49,16 @@ def write_folder(result: Reconstructed, work: Path, out: Path, progress: Progres
     ready.rmdir()
 
 
-def _make(result: Reconstructed, folder: Path, progress: Progress) -> None:
+def _make(result: Reconstructed, folder: Path, name: str, progress: Progress) -> None:
     (folder / IMAGES).mkdir(parents=True)
     posed = result.part.posed
     for it in tracked("photographs", posed, len(posed), progress):
         shutil.copyfile(it.picture.path, folder / IMAGES / file_name(it))
     images = [PosedImage(file_name(it), it.camera, it.world_from_camera) for it in posed]
-    scene = _scene(folder, result.world, len(posed))
+    scene = _scene(name, result.world, len(posed))
     source = f"mapless-server reconstruct, pycolmap {pycolmap.__version__}"
-    for name, text in cameras_files(images, source, scene).items():
-        (folder / name).write_text(text, encoding="utf-8")
+    for file, text in cameras_files(images, source, scene).items():
+        (folder / file).write_text(text, encoding="utf-8")
     (folder / REPORT).write_text(report(result), encoding="utf-8")
     (folder / PICTURE).write_bytes(to_gltf(scene, _views(result.part)))
 
@@ -66,9 +68,9 @@ def file_name(posed: PosedPicture) -> str:
     return f"{posed.picture.name}{posed.picture.path.suffix.lower()}"
 
 
-def _scene(folder: Path, world: WorldFrame, count: int) -> KnownScene:
+def _scene(name: str, world: WorldFrame, count: int) -> KnownScene:
     return KnownScene(
-        folder.name,
+        name,
         0,
         count,
         datetime.now(UTC),
@@ -108,11 +110,10 @@ def report(result: Reconstructed) -> str:
     unit = "m" if world.is_metric else "units"
     poses = [it.world_from_camera for it in part.posed]
     down = down_of(None, poses) if world.down_in_world is None else np.asarray(world.down_in_world)
+    points = part.points_in_world[:: 1 + len(part.points_in_world) // POINTS_ON_PLAN]
     axes = new_axes("From above", "", "")
     cameras = [(it.world_from_camera, it.camera) for it in part.posed]
-    draw_plan(
-        axes, basis_from_above(down), [Cameras("photographs", REFERENCE, cameras)], part.points_in_world, unit=unit
-    )
+    draw_plan(axes, basis_from_above(down), [Cameras("photographs", REFERENCE, cameras)], points, unit=unit)
     return render(
         "reconstruction.html",
         title=summary(result),

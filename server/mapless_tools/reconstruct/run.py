@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pycolmap
 
-from mapless_server.choices import AUTO
+from mapless_server.choices import AUTO, BEST_VARIANTS, FEATURES
 from mapless_server.method.features.matching import OPTIONS, fastest_arithmetic
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.serve.assembly import make_first_features
@@ -52,6 +52,9 @@ class ReconstructOptions:
     def __post_init__(self) -> None:
         if self.part < 1:
             raise ValueError(f"part must be at least 1, is {self.part}")
+        known = (AUTO, *FEATURES, *BEST_VARIANTS)
+        if self.features not in known:
+            raise ValueError(f"features must be one of {', '.join(known)}, is {self.features!r}")
 
 
 @dataclass(frozen=True)
