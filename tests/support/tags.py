@@ -1,4 +1,4 @@
-"""Printed tags in photographs with known poses: drawn by their homography, with smooth edges."""
+"""Printed tags in photographs with known poses: drawn by their homography, with edges smooth in linear light."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.images.exif import NO_EXIF, Exif
 from mapless_tools.reconstruct.pictures import Part, Picture, PosedPicture
+from mapless_tools.reconstruct.world.corners import LIGHT
 
 Image = NDArray[np.uint8]
 PART_FROM_WORLD = Similarity(1 / 0.37, rotation_from_vector([0.4, -1.1, 0.7]), np.array([3.0, -2.0, 5.0]))
@@ -47,9 +48,12 @@ class PrintedTag:
         sheet_seen = cv2.warpPerspective(sheet, homography, size, flags=cv2.INTER_AREA)
         cover = cv2.warpPerspective(np.full_like(sheet, 255), homography, size)
         light, share = (cv2.resize(it, (width, height), interpolation=cv2.INTER_AREA) for it in (sheet_seen, cover))
-        light = (30 + light * (190 / 255)) * (share / 255)
-        painted = image * (1 - share[..., None] / 255) + light[..., None]
-        return np.clip(painted, 0, 255).astype(np.uint8)
+        seen = share > 0
+        covered = (share[seen] / 255)[:, None]
+        mixed = LIGHT[image[seen]] * (1 - covered) + covered * (0.02 + 0.6 * (light[seen] / 255)[:, None])
+        painted = image.copy()
+        painted[seen] = np.searchsorted(LIGHT, mixed).clip(0, 255)
+        return painted
 
 
 def photographed(

@@ -15,7 +15,9 @@ from mapless_tools.dataset import Frame
 from mapless_tools.demo.photographs import ROOM
 from mapless_tools.ingest.formats import read_dataset
 from mapless_tools.reconstruct.pictures import Part, WorldFrame
-from mapless_tools.reconstruct.world.options import FAMILIES, WorldFlags
+from mapless_tools.reconstruct.world.corners import LIGHT
+from mapless_tools.reconstruct.world.flags import WorldFlags
+from mapless_tools.reconstruct.world.options import FAMILIES
 from mapless_tools.reconstruct.world.placing import place
 
 CAMERA = Camera(480, 360, 420.0, 420.0, 239.5, 179.5)
@@ -206,6 +208,21 @@ def test_a_camera_that_only_turns_gives_no_unit(tmp_path: Path) -> None:
 def test_wrong_flags_are_named(tags: list[str], origin: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         WorldFlags(tag=tags, origin=origin).options()
+
+
+def test_a_blurred_tag_is_as_large_as_a_sharp_one(tmp_path: Path) -> None:
+    """Blur is of light, not of the file's values; a detector's corners are 2 % off here."""
+    part = photographed(tmp_path, CAMERA, walk(), [on_wall(0.0)])
+    posed = []
+    for i, pose in enumerate(walk()):
+        image = cv2.imread(str(part.posed[i].picture.path))
+        assert image is not None
+        blurred = cv2.GaussianBlur(LIGHT[image], (0, 0), 1.0)
+        values = np.searchsorted(LIGHT, blurred).clip(0, 255).astype(np.uint8)
+        posed.append(posed_picture(tmp_path, f"blurred-{i}", values, CAMERA, pose))
+    found, frame = placed(part_of(posed), "36h11:0=0.16")
+    assert frame.is_metric
+    assert length_ratio(found, walk()) == pytest.approx(1, abs=0.006)
 
 
 def test_families_are_those_of_opencv() -> None:

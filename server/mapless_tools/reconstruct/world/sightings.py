@@ -1,4 +1,4 @@
-"""Tags in photographs: their corners, undistorted, by OpenCV's detector with corners to a fraction of a pixel."""
+"""Tags in photographs, by OpenCV's detector, with corners to a tenth of a pixel, undistorted."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ANY_SIZE, decode_image
-from mapless_server.method.features.views import undistort_pixels
 from mapless_tools.progress import Progress, tracked
 
 from ..pictures import PosedPicture
+from .corners import ideal_corners
 from .options import FAMILIES, TagId
 
 STEP = "tags"
@@ -39,14 +39,15 @@ def sightings(
     ValueError if a photograph cannot be read.
     """
     detectors = {family: _detector(family) for family in sorted(set(families))}
+    modules = {family: _dictionary(family).markerSize + 2 for family in detectors}
     found: dict[TagId, list[Sighting]] = {}
     for index, it in enumerate(tracked(STEP, posed, len(posed), progress)):
         grey = _grey(it)
         for family, detector in detectors.items():
             corners, numbers, _ = detector.detectMarkers(grey)
             for shown_px, number in zip(corners, () if numbers is None else numbers.ravel(), strict=True):
-                ideal_px = undistort_pixels(shown_px.reshape(4, 2).astype(float), it.camera)
-                if np.isfinite(ideal_px).all():
+                ideal_px = ideal_corners(grey, shown_px.reshape(4, 2).astype(float), modules[family], it.camera)
+                if ideal_px is not None:
                     edges_px = np.linalg.norm(ideal_px - np.roll(ideal_px, 1, axis=0), axis=1)
                     sighting = Sighting(index, ideal_px, float(edges_px.max()))
                     found.setdefault(TagId(family, int(number)), []).append(sighting)
@@ -70,5 +71,8 @@ def _grey(posed: PosedPicture) -> NDArray[np.uint8]:
 def _detector(family: str) -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[family][0]))
-    return cv2.aruco.ArucoDetector(dictionary, parameters)
+    return cv2.aruco.ArucoDetector(_dictionary(family), parameters)
+
+
+def _dictionary(family: str) -> cv2.aruco.Dictionary:
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, FAMILIES[family][0]))

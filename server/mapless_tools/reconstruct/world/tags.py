@@ -17,9 +17,9 @@ MAX_EDGE_SIGMA = 0.05
 MAX_DEFORMATION = 0.03
 """Largest root mean square of a tag's corners from a square, as a share of its edge: sheets of paper are bent by 1 or
 2 %, what is no tag is no square."""
-CORNER_SIGMA_PX = 0.1
-"""How far each side of a black square may appear inside or outside its true line, from overexposure and blur; alike in
-all photographs, so that no number of them averages it out."""
+CORNER_SIGMA_PX = 0.2
+"""How far each side of a black square may appear inside its true line where white is overexposed: 0.05 to 0.3 pixels in
+the rendered room; alike in all photographs, so that no number of them averages it out."""
 SIZE_SIGMA_M = 0.0005
 """Standard deviation of a length that was read on a ruler."""
 _MAX_NAMED = 3
