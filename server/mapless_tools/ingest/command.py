@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from mapless_command.installation import how_to_install
+from mapless_server.extras import missing_package
 from mapless_server.serve.command import fail
 from mapless_tools.bags.options import BagOptions
 from mapless_tools.connection import Connection, Scene, with_flags
@@ -51,7 +54,13 @@ class ImportCommand(TyperCommand):
 
 @with_flags
 def import_command(
-    folder: Annotated[Path, typer.Argument(help="Folder with photographs and their poses, or a robot's recording.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with photographs and their poses, or a recording of a robot; or a video, "
+            "whose poses are computed first, into a folder beside it (by reconstruct, which has more flags)."
+        ),
+    ],
     scene: Scene,
     format: Annotated[str, typer.Option(help=f"Layout of the folder: {FORMAT_NAMES}.")] = "auto",
     images: Annotated[Path | None, typer.Option(help="Folder of a COLMAP model's images.")] = None,
@@ -77,6 +86,13 @@ def import_command(
     distance: Annotated[
         list[str] | None,
         typer.Option(metavar="A B METRES", help="Measured distance of the cameras of two references; may be repeated."),
+    ] = None,
+    tag: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FAMILY:ID=METRES",
+            help="In a video: a printed AprilTag or ArUco marker and the edge of its black square; may be repeated.",
+        ),
     ] = None,
     align: Annotated[
         Path | None, typer.Option(help="CSV file of known camera positions: reference, x, y, z in metres.")
@@ -135,6 +151,7 @@ def import_command(
             parallel=parallel,
         )
         settings = _settings(data_dir, connection)
+        folder = _posed(folder, tag or ())
         went_well = run_import(folder, scene, options, settings, None if dry_run else connection, report)
     except (ValueError, ConfigError) as error:
         fail(str(error))
@@ -173,6 +190,27 @@ def export_command(
         count = len(export.damaged)
         fail(f"{export.written} of {export.total} written, {count} damaged; the {export.written} {where}", code=1)
     print(f"{export.written} {where}")
+
+
+def _posed(source: Path, tags: Sequence[str]) -> Path:
+    """A folder of photographs with poses, which are computed if it is a video."""
+    from mapless_tools.reconstruct.sources.finding import VIDEOS
+
+    if not source.is_file() or source.suffix.lower() not in VIDEOS:
+        if tags:
+            raise ValueError(f"--tag gives the unit of a video, and {source} is none")
+        return source
+    if package := missing_package("reconstruct"):
+        raise ValueError(f"a video needs the Python package {package}: {how_to_install('reconstruct')}")
+    from mapless_tools.reconstruct.folder import reconstruct_into
+    from mapless_tools.reconstruct.run import ReconstructOptions
+    from mapless_tools.reconstruct.sources import SourceOptions
+    from mapless_tools.reconstruct.world.options import WorldOptions, parse_sized_tag
+
+    out = source.with_name(f"{source.stem}-posed")
+    world = WorldOptions(tags=tuple(map(parse_sized_tag, tags)))
+    reconstruct_into([source], out, SourceOptions(excluded=(out,)), ReconstructOptions(world=world))
+    return out
 
 
 def _settings(data_dir: Path | None, connection: Connection) -> Settings:

@@ -41,23 +41,16 @@ def reconstruct_command(
     Run it again to go on where it was interrupted. The folder gets photographs, cameras.json, report.html and
     scene.glb, all of them or none.
     """
-    from mapless_server.serve.signals import terminable
-    from mapless_tools.progress import progress_bars
     from mapless_tools.usage import failures_end_command
 
     from .cameras import LensOptions
-    from .output import REPORT, printed, write_folder
-    from .run import ReconstructOptions, prepare, reconstruct
-    from .sources import SourceOptions, read_sources
+    from .folder import reconstruct_into
+    from .run import ReconstructOptions
+    from .sources import SourceOptions
 
     with failures_end_command(ValueError, interrupted="interrupted; run it again to go on"):
         *sources, out = paths
         wanted = SourceOptions(frames=frames, excluded=(out,))
         options = ReconstructOptions(part, features, LensOptions.of(lens or ()), world.options())
-        with terminable(), progress_bars() as progress:
-            work = prepare(sources, out)
-            pictures = read_sources(sources, work / "pictures", wanted, progress)
-            result = reconstruct(pictures, work, options, progress)
-            write_folder(result, work, out, progress)
-    print("\n".join(printed(result)))
-    print(f"they are in {out}; look at {out / REPORT}, then: mapless-server import {out} SCENE")
+        reconstruct_into(sources, out, wanted, options)
+    print(f"to localize in it: mapless-server import {out} SCENE")

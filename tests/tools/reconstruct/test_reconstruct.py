@@ -8,8 +8,11 @@ import cv2
 import numpy as np
 import pytest
 from support.images import encode, textured
+from typer.testing import CliRunner
 
+from mapless.cli.output import plain
 from mapless.geometry import Array
+from mapless_tools.cli.app import app
 from mapless_tools.demo.photographs import Photograph, room
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.metres import umeyama
@@ -153,3 +156,19 @@ def test_folder_of_others_is_not_written_to(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not empty"):
         prepare([tmp_path], tmp_path)
     assert [it.name for it in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_import_of_a_video_of_two_frames_says_what_is_needed(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    file = tmp_path / "walk.mp4"
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("mpeg4", rate=2)
+        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
+        for seed in (1, 2):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(textured(320, 240, seed=seed), "rgb24")))
+        container.mux(stream.encode())
+    result = CliRunner().invoke(app, ["import", str(file), "hall", "--dry-run"])
+    assert result.exit_code == 2
+    assert "too few" in plain(result.output)
+    result = CliRunner().invoke(app, ["import", str(tmp_path), "hall", "--tag", "36h11:0=0.1"])
+    assert "the unit of a video" in plain(result.output)
