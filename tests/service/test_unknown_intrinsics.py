@@ -11,7 +11,7 @@ from support.corner import CAMERA, make_corner, photograph, pose
 from support.images import encode, textured
 from support.servers import serving_really
 
-from mapless import Camera, Client, IntrinsicsUncertainty, InvalidArgument, LocalizationResult, Rejected
+from mapless import Camera, Client, IntrinsicsUncertainty, InvalidArgument, LocalizationResult, NewReference, Rejected
 
 SQUARE = Camera.centred(420, 420, 352.0)
 """Other sides than those of the references."""
@@ -26,8 +26,8 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
         yield client
 
 
-def localized(client: Client, image: bytes) -> LocalizationResult:
-    answer = client.localize(image, scene="corner")
+def localized(client: Client, image: bytes, scene: str = "corner") -> LocalizationResult:
+    answer = client.localize(image, scene=scene)
     assert isinstance(answer, LocalizationResult), answer
     off_m = math.dist(answer.world_from_camera.translation, THERE.translation)
     assert answer.accuracy is not None
@@ -35,8 +35,10 @@ def localized(client: Client, image: bytes) -> LocalizationResult:
     return answer
 
 
-def with_exif(image: bytes, film_focal_mm: float) -> bytes:
+def with_exif(image: bytes, film_focal_mm: float, model: str = "") -> bytes:
     exif, file = Image.Exif(), io.BytesIO()
+    if model:
+        exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker", model
     exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = round(film_focal_mm)
     Image.open(io.BytesIO(image)).convert("RGB").save(file, "JPEG", quality=95, exif=exif)
     return file.getvalue()
@@ -70,6 +72,21 @@ def test_exif_gives_the_focal_length_unless_it_lies(client: Client) -> None:
         assert used is not None
         assert used.source == source
         assert used.camera.focal_x_px == pytest.approx(350.0, rel=0.02)
+
+
+def test_references_with_the_same_exif_have_the_camera(client: Client) -> None:
+    """Also of a photograph that was resized; as accurate as if it were given."""
+    client.create_scene("exif")
+    poses = [pose(angle) for angle in (-25, -15, -5, 5, 15, 25)]
+    images = [with_exif(photograph(it), film_mm(CAMERA), "A") for it in poses]
+    client.add_references("exif", [NewReference(f"r{i}", image, CAMERA, poses[i]) for i, image in enumerate(images)])
+    small = CAMERA.resized(CAMERA.width_px // 2, CAMERA.height_px // 2)
+    for model, source in (("A", "SCENE_CAMERA"), ("B", "EXIF")):
+        image = with_exif(photograph(THERE, small), film_mm(small), model)
+        used = localized(client, image, "exif").used_intrinsics
+        assert used is not None
+        assert used.source == source
+        assert (used.camera == small) == (model == "A")
 
 
 def test_given_intrinsics_are_named_as_such(client: Client) -> None:

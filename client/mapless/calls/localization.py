@@ -57,8 +57,8 @@ async def _localize_request(
     Args:
         image: the photograph.
         camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation; None if it is
-            not known: the server then takes the focal length in the file's EXIF, or the camera of references with the
-            same sides, or estimates it (`LocalizationResult.used_intrinsics`).
+            not known: the server then takes that of references with the same EXIF, the focal length in the file's EXIF,
+            or the camera of references with the same sides, or estimates it (`LocalizationResult.used_intrinsics`).
         scene: the scene to localize in.
         references: the references to use, most similar first, at most 64; empty: the server chooses.
         priors: knowledge of the pose before the photograph is used, for example its position.

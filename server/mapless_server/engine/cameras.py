@@ -10,11 +10,11 @@ from mapless.geometry import Camera
 from mapless_server.engine.search import Material, Search
 from mapless_server.images.exif import focal_of
 from mapless_server.method.bundle.intrinsics import read_as
-from mapless_server.method.features.views import Features, Matches, View
+from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.options import ChosenCamera, IntrinsicsSource
 from mapless_server.method.pipeline import Prepared
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.method.unknown_camera import UNKNOWN, choose_camera
+from mapless_server.method.unknown_camera import UNKNOWN, camera_of_references, choose_camera
 
 from .query import Photo
 
@@ -32,7 +32,9 @@ def with_camera(search: Search, prepared: Prepared) -> Material | Rejection:
     assert material.query_matches is not None
     raw = read_as(prepared.query, prepared.query.camera.pinhole())  # with keypoints as the image shows them
     width_px, height_px = raw.camera.width_px, raw.camera.height_px
-    guesses = [replace(it, camera=it.camera.resized(width_px, height_px)) for it in known_cameras(photo)]
+    guesses = [
+        replace(it, camera=it.camera.resized(width_px, height_px)) for it in known_cameras(photo, prepared.references)
+    ]
     with search.context.stage(CAMERA):
         found = choose_camera(raw, prepared.references, prepared.correspondences, guesses)
     if found is None:
@@ -43,9 +45,13 @@ def with_camera(search: Search, prepared: Prepared) -> Material | Rejection:
     return replace(material, view=view, query_matches=matches, camera=replace(found, camera=sent))
 
 
-def known_cameras(photo: Photo) -> Iterator[ChosenCamera]:
+def known_cameras(photo: Photo, references: Sequence[PosedView]) -> Iterator[ChosenCamera]:
     """The cameras that EXIF knows of a photograph without intrinsics, the likeliest first."""
     assert photo.exif is not None
+    if optics := photo.exif.optics:
+        same = [it for it in references if it.view.photograph and it.view.photograph.read_exif().optics == optics]
+        if camera := camera_of_references(photo.camera, same):
+            yield camera
     width_px, height_px = photo.camera.width_px, photo.camera.height_px
     with suppress(ValueError):  # of a part of a photograph EXIF says nothing
         focal = focal_of(photo.exif, width_px, height_px)

@@ -69,6 +69,13 @@ class Exif:
     position: GpsPosition | None = None
     direction_deg: float | None = None
 
+    @property
+    def optics(self) -> tuple[object, ...]:
+        """What photographs of one camera, with one lens at one focal length, have in common; empty if nothing says."""
+        if not (self.make and self.model):
+            return ()
+        return self.make, self.model, self.lens, self.focal_mm, self.film_focal_mm, self.digital_zoom
+
 
 NO_EXIF = Exif()
 

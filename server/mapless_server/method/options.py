@@ -49,10 +49,13 @@ class IntrinsicsSource(str, Enum):
 
 @dataclass(frozen=True)
 class ChosenCamera:
-    """A camera of a photograph without intrinsics, how far it may be off without the matches, and where it is from."""
+    """A camera of a photograph without intrinsics, how far it may be off without the matches, and where it is from.
+
+    As of `LocalizeOptions`, no standard deviations are the usual ones.
+    """
 
     camera: Camera
-    sigma: IntrinsicsSigma
+    sigma: IntrinsicsSigma | None
     source: IntrinsicsSource
 
 

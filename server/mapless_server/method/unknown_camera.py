@@ -9,8 +9,8 @@ pose and focal length together minimize
 
     sum_i rho(|u_i - pi(f, P, X_i)|^2) + w (ln f - ln f_0)^2 / sigma^2,    rho(s) = c^2 log(1 + s / c^2)
 
-with the guess's standard deviation sigma. A camera of references stays as it is unless this differs from it by more
-than chance.
+with the guess's standard deviation sigma. A camera of references is improved no further than their focal lengths differ
+among each other, unless this differs from it by more than chance: then it is another one.
 
 From then on everything is as for intrinsics that were given with this standard deviation: the adjustment finds how much
 the matches determine, and of a flat wall that is little. That the references' camera fits makes the pose more accurate,
@@ -120,21 +120,42 @@ def choose_camera(
     if best.pose is None:
         return None
     found = next(it for it in options if not is_significant(sigmas_of_gains(best.scores - it.scores), len(options)))
-    improved, sigmas = _improved(matches, found)
+    log_ratio, sigma = _improved(matches, found)
     if found.guess.source is not IntrinsicsSource.SCENE_CAMERA:
-        return improved
-    return found.guess if sigmas < DOUBTED_SIGMAS else replace(improved, source=IntrinsicsSource.ESTIMATED)
+        return replace(found.guess, camera=scaled(found.guess.camera, log_ratio))
+    if abs(log_ratio) >= DOUBTED_SIGMAS * sigma:  # then it is another camera
+        estimated = scaled(found.guess.camera, log_ratio)
+        return ChosenCamera(estimated, UNKNOWN, IntrinsicsSource.ESTIMATED)
+    spread = np.std([np.log(it.focal_x_px) for it in _cameras_of(view.camera, references)])
+    return replace(found.guess, camera=scaled(found.guess.camera, log_ratio * spread**2 / (spread**2 + sigma**2)))
 
 
 def _of_references(view: View, references: Sequence[PosedView]) -> Sequence[ChosenCamera]:
-    """The camera of references whose photographs have the same sides: that of the median focal length."""
-    raster, cameras = view.camera, list[Camera]()
+    camera = camera_of_references(view.camera, references)
+    return [replace(camera, sigma=UNKNOWN)] if camera else ()
+
+
+def camera_of_references(raster: Camera, references: Sequence[PosedView]) -> ChosenCamera | None:
+    """The camera of references of one camera, of which some have a raster of the same sides; None if none has.
+
+    That of the median focal length. If these differ by more than usual, as those of a reconstruction that refines each
+    photograph's own, none is exact for another photograph.
+    """
+    cameras, usual = _cameras_of(raster, references), IntrinsicsSigma().focal_share
+    if not cameras:
+        return None
+    is_one = cameras[-1].focal_x_px <= (1 + 2 * usual) * cameras[0].focal_x_px
+    return ChosenCamera(cameras[len(cameras) // 2], None if is_one else UNKNOWN, IntrinsicsSource.SCENE_CAMERA)
+
+
+def _cameras_of(raster: Camera, references: Sequence[PosedView]) -> list[Camera]:
+    """The cameras of references whose photographs have the same sides, resized to a raster, by their focal length."""
+    cameras = list[Camera]()
     for it in references:
         camera = it.view.photograph.camera if it.view.photograph else it.view.camera
         if abs(camera.width_px * raster.height_px - raster.width_px * camera.height_px) <= camera.width_px:
             cameras.append(camera.resized(raster.width_px, raster.height_px))
-    cameras.sort(key=lambda it: it.focal_x_px)
-    return [ChosenCamera(it, UNKNOWN, IntrinsicsSource.SCENE_CAMERA) for it in cameras[len(cameras) // 2 :][:1]]
+    return sorted(cameras, key=lambda it: it.focal_x_px)
 
 
 def _series(camera: Camera) -> Iterator[ChosenCamera]:
@@ -145,27 +166,26 @@ def _series(camera: Camera) -> Iterator[ChosenCamera]:
         yield ChosenCamera(centred, UNKNOWN, IntrinsicsSource.ESTIMATED)
 
 
-def _improved(matches: _Matches, found: _Scored) -> tuple[ChosenCamera, float]:
-    """The camera with the most probable focal length, by the points that are near at the pose that was found.
+def _improved(matches: _Matches, found: _Scored) -> tuple[float, float]:
+    """The most probable logarithm of the ratio of the focal length to that of the camera, by the points near its pose.
 
-    Also by how many standard deviations that differs; 0 and the camera itself where the points are too few.
+    Also its standard deviation; 0 and infinity where the points are too few.
     """
-    camera, sigma, pose = found.guess.camera, found.guess.sigma.focal_share, found.pose
-    if pose is None:
-        return found.guess, 0.0
-    log_ratio, sigmas = 0.0, 0.0
+    camera, prior, pose = found.guess.camera, (found.guess.sigma or IntrinsicsSigma()).focal_share, found.pose
+    log_ratio, sigma = 0.0, np.inf
     for _ in range(2):  # which points are near at a pose of a camera that is a step off
-        better = replace(found.guess, camera=scaled(camera, log_ratio))
-        evidence = matches.evidence(better.camera)
+        if pose is None:
+            break
+        evidence = matches.evidence(scaled(camera, log_ratio))
         near = np.nan_to_num(evidence.points.errors_px(pose), nan=np.inf) < INEXACT_INLIER_PX
         if near.sum() < LEAST_MATCHES:
-            return better, sigmas
+            break
         pixels = matches.view.features.pixels(evidence.keypoint[near])
-        problem = _Focal(camera, pixels, evidence.x_in_world[near], sigma)
+        problem = _Focal(camera, pixels, evidence.x_in_world[near], prior)
         log_ratio, camera_from_world = minimize(problem, (log_ratio, pose.inverse()), STEPS)
         variance = np.linalg.pinv(problem.linearize((log_ratio, camera_from_world))[0], hermitian=True)[6, 6]
-        pose, sigmas = camera_from_world.inverse(), abs(log_ratio) / (AdjustOptions.error_inflation * np.sqrt(variance))
-    return replace(found.guess, camera=scaled(camera, log_ratio)), float(sigmas)
+        pose, sigma = camera_from_world.inverse(), AdjustOptions.error_inflation * float(np.sqrt(variance))
+    return log_ratio, sigma
 
 
 def scaled(camera: Camera, log_ratio: float) -> Camera:

@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.names import reference_name
+from mapless_server.cache import LruCache
 from mapless_server.errors import AlreadyExists, DataLoss, InvalidArgument, RequestError, Unavailable
 from mapless_server.images import ANY_SIZE, decode_image, decode_mask, upright_of
+from mapless_server.images.exif import Exif, read_exif
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.extractors.turned import extract_upright
 from mapless_server.method.features.views import Ignored, Photograph, PosedView, View
@@ -30,6 +32,8 @@ from .stored import DepthFinder
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.05
+_REMEMBERED_EXIFS = 20_000
+"""Of so many references EXIF is kept in memory, half a KB each."""
 
 Loaded = tuple[SceneState, tuple[PosedView, ...]]
 """A scene and references of it, read at one moment."""
@@ -83,6 +87,7 @@ class ReferenceLibrary:
         self._store = store
         self._depths = depths
         self.locks = KeyedLocks()
+        self._exifs: LruCache[Exif] = LruCache(_REMEMBERED_EXIFS)
         self._background = ThreadPoolExecutor(1, "describe")
         self._scheduled: set[tuple[str, str]] = set()
         self._scheduling = threading.Lock()
@@ -184,7 +189,7 @@ class ReferenceLibrary:
     def posed_view(self, reference: DescribedReference) -> PosedView:
         """A stored reference as the pipeline needs it; its photograph is read when its pixels are first used."""
         record, view = reference.record, reference.view
-        read = partial(self._pixels, record), partial(self._ignored, record)
+        read = partial(self._pixels, record), partial(self._ignored, record), partial(self._exif, record)
         photograph = Photograph(lambda: record.image_sha256, record.camera, *read)
         return PosedView(
             record.key,
@@ -192,6 +197,14 @@ class ReferenceLibrary:
             replace(view, photograph=photograph),
             record.world_from_camera,
         )
+
+    def _exif(self, record: ReferenceRecord) -> Exif:
+        """Reads the photograph's EXIF, once as long as it is remembered; NotFound if the reference was deleted."""
+        known = self._exifs.get(record.key)
+        if known is None:
+            known = read_exif(self._store.read_image_of(record.key))
+            self._exifs.put(record.key, known, 1)
+        return known
 
     def _pixels(self, record: ReferenceRecord) -> NDArray[np.uint8]:
         """Reads the photograph, (H, W, 3) RGB; NotFound if the reference was deleted, DataLoss if it is damaged."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Distortion, Fisheye, RadialTangential, lens_model_of
+from mapless_server.images.exif import NO_EXIF, Exif
 
 Matches = NDArray[np.int32]
 """(M, 2): keypoint indices in the first and in the second of two views."""
@@ -105,12 +106,14 @@ class Photograph:
         camera: camera in pixels of the image, with its lens distortion.
         read: function that returns the pixels, (H, W, 3) uint8 RGB, of the camera's size.
         read_ignored: function that returns the ignored pixels, of the same size; None if all are used.
+        read_exif: function that returns the EXIF of the file.
     """
 
     identify: Callable[[], str]
     camera: Camera
     read: Callable[[], NDArray[np.uint8]]
     read_ignored: Callable[[], Ignored | None] = lambda: None
+    read_exif: Callable[[], Exif] = lambda: NO_EXIF
 
     @cached_property
     def sha256(self) -> str:
