@@ -87,6 +87,10 @@ def queries_from_message(
                 check_capture_time(message)
             reference_ids = reference_ids_from_names(message.references, scene_id, most_references)
             narrowing, priors = priors_from_message(message, attributes)
+            if not message.HasField("intrinsics"):
+                raise FieldError(
+                    "intrinsics", "is required of rigs and sequences; a single photograph may come without"
+                )
         queries.append(
             Query(
                 scene_key=key_of(tenant, scene_id),
