@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def ignore(step: str, done: int, total: int) -> None:
         nightly("herz-jesus-P8", None, None, 0.40, 0.020),
         nightly(KITCHEN, 30, None, 0.19, 0.060),
         nightly(KITCHEN, 10, 15, 0.45, 0.13),
-        (KITCHEN, 10, 4, 0.45, 0.13),
+        (KITCHEN, 10, 2, 0.45, 0.13),
         nightly(DRIVE, None, None, 0.50, 0.030),
         # 0.204 degrees before the poses of references were taken to drift; COLMAP has 0.205 to 0.235.
         nightly(OFFICE, None, None, 0.50, 0.225),
@@ -75,14 +76,15 @@ FORMS_CM = {
 
 
 def test_every_form_of_the_method_localizes(photographs: Photographs, tmp_path: Path) -> None:
-    """Three photographs of the fountain, each from all others."""
+    """Three photographs of the fountain for the best one, one for the others, each from all others."""
     plan = plan_for(photographs("fountain-P11"), EvaluationOptions(query_count=3), Settings(), ignore)
     with child_server(tmp_path) as server, Client(server.address, CONNECT) as client:
         store_references(client, SCENE, plan.references, ignore)
         for (variant, strategy), translation_cm in FORMS_CM.items():
             options = EvaluationOptions(variant=variant, scale_strategy=strategy)
-            summary = summarize(localize_queries(client, plan, options, ignore))
-            assert summary.localized_count == 3, options
+            asked = plan.queries if variant == "best" else plan.queries[:1]
+            summary = summarize(localize_queries(client, replace(plan, queries=asked), options, ignore))
+            assert summary.localized_count == len(asked), options
             assert 100 * summary.median_translation <= translation_cm, options
 
 

@@ -134,6 +134,15 @@ class TestAdmission:
         run_through(toy)
         np.testing.assert_allclose(quota.settled, [(0.6, 0.0), (0.6, 0.6)])
 
+    def test_jobs_that_fail_together_are_counted_and_paid_back(self) -> None:
+        quota = PlantedQuota()
+        toy = Toy(quota=quota)
+        for _ in range(2):
+            toy.admit()
+        toy.scheduler.fail_all(RuntimeError("planted"), toy.now_s)
+        assert toy.observer.endings == {Ending.FAILED: 2}
+        np.testing.assert_allclose(quota.settled, [(0.6, 0.0)] * 2)
+
 
 class TestOrder:
     def test_begun_jobs_finish_first_without_starving_others(self) -> None:

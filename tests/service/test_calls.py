@@ -152,6 +152,13 @@ def test_health_lists_all_services(server: RunningServer) -> None:
     assert {it.status for it in listed.statuses.values()} == {health_pb2.HealthCheckResponse.SERVING}
 
 
+@pytest.fixture(scope="module")
+def strict(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    """A server whose messages have at most two MiB."""
+    with serving(tmp_path_factory.mktemp("strict"), max_image_mib=1, max_message_mib=2) as running:
+        yield running
+
+
 @pytest.mark.parametrize(
     "method",
     [
@@ -164,18 +171,18 @@ def test_health_lists_all_services(server: RunningServer) -> None:
     ],
 )
 def test_no_message_puts_a_stack_trace_into_the_log(
-    server: RunningServer, method: str, caplog: pytest.LogCaptureFixture
+    strict: RunningServer, method: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """33 MiB of zeros are 33 KB as gzip; grpc rejects them when it has inflated them, while the handler waits."""
+    """3 MiB of zeros are 3 KB as gzip; grpc rejects them when it has inflated them, while the handler waits."""
     caplog.set_level(logging.INFO)
-    with grpc.insecure_channel(server.address, options=[("grpc.max_send_message_length", 2**27)]) as channel:
+    with grpc.insecure_channel(strict.address) as channel:
         call = channel.stream_stream(f"/{method}")
         for _ in range(3):  # grpc's status and the handler's race
             with pytest.raises(grpc.RpcError) as caught:
-                list(call(iter([bytes(33 * 2**20)]), timeout=20, compression=grpc.Compression.Gzip))
+                list(call(iter([bytes(3 * 2**20)]), timeout=20, compression=grpc.Compression.Gzip))
             failure: Any = caught.value
             assert failure.code() in (grpc.StatusCode.RESOURCE_EXHAUSTED, grpc.StatusCode.UNIMPLEMENTED)
     # The server writes in another thread, but before the next call has its answer.
-    with grpc.insecure_channel(server.address) as channel:
+    with grpc.insecure_channel(strict.address) as channel:
         channel.unary_unary("/grpc.health.v1.Health/Check")(b"", timeout=20)
     assert [record.getMessage() for record in caplog.records if record.exc_info] == []

@@ -2,17 +2,21 @@
 
 import re
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from support.commands import run
+from support.images import encode
 from support.servers import RunningServer, serving_really
 from support.waiting import wait_until
 
 import mapless_tools.demo
 from mapless import Client, GroupRejected, NewReference, Rejected, RigidTransform, SequenceFrame
 from mapless.geometry import Similarity, rotation_from_vector
+from mapless_server.images import ImageLimits, decode_image
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.formats.cameras import read_folder
 
@@ -21,6 +25,7 @@ ALL = [it for it in FRAMES if "query" not in it.name]
 REFERENCES = ALL[:5]
 QUERIES = [it for it in FRAMES if "query" in it.name][:2]
 PATIENT_S = 120.0
+SIZE_PX = (480, 360)
 Reading = Callable[[RigidTransform], RigidTransform]
 READINGS: dict[str, Reading] = {
     "right": lambda pose: pose,
@@ -32,8 +37,15 @@ OTHER_FROM_WORLD = Similarity(0.4, rotation_from_vector(OTHER_ROTATION), np.arra
 """World of a second session with half of the references."""
 
 
+@cache
+def photo(frame: Frame) -> bytes:
+    """At half its size, which is enough here and four times as fast."""
+    whole = decode_image(frame.image_path.read_bytes(), ImageLimits())
+    return encode(".png", np.asarray(cv2.resize(whole, SIZE_PX, interpolation=cv2.INTER_AREA), np.uint8))
+
+
 def reference(frame: Frame, read: Reading) -> NewReference:
-    return NewReference(frame.name, frame.image_path, frame.camera, read(frame.world_from_camera))
+    return NewReference(frame.name, photo(frame), frame.camera.resized(*SIZE_PX), read(frame.world_from_camera))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +55,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
             client.create_scene(scene)
             client.add_references(scene, [reference(it, read) for it in REFERENCES])
         client.create_scene("sessions")
-        for session, pose_of in ((ALL[::2], READINGS["right"]), (ALL[1::2], OTHER_FROM_WORLD.transform_pose)):
+        for session, pose_of in ((ALL[:12:2], READINGS["right"]), (ALL[1:12:2], OTHER_FROM_WORLD.transform_pose)):
             client.add_references("sessions", [reference(it, pose_of) for it in session])
         client.create_scene("start")
         client.add_references("start", [reference(it, lambda _: RigidTransform.identity()) for it in ALL[:4]])
@@ -62,8 +74,8 @@ def test_wrong_poses_are_said_and_answer_nothing(client: Client) -> None:
     known = client.get_scene("opengl")
     assert known.warnings == (known.contradiction,)
     assert known.agreeing_pair_count < known.compared_pair_count / 2
-    sequence = [SequenceFrame(it.image_path, it.camera, it.world_from_camera) for it in QUERIES]
-    alone = client.localize(QUERIES[0].image_path, QUERIES[0].camera, "opengl", timeout_s=PATIENT_S)
+    sequence = [SequenceFrame(photo(it), it.camera.resized(*SIZE_PX), it.world_from_camera) for it in QUERIES]
+    alone = client.localize(sequence[0].image, sequence[0].camera, "opengl", timeout_s=PATIENT_S)
     together = client.localize_sequence(sequence, "opengl", timeout_s=PATIENT_S)
     assert isinstance(alone, Rejected)
     assert isinstance(together, GroupRejected)
@@ -76,14 +88,14 @@ def test_wrong_poses_are_said_and_answer_nothing(client: Client) -> None:
 def test_a_second_session_is_said_with_the_similarity_that_aligns_it(client: Client) -> None:
     wait_until(
         lambda: (
-            re.search("groups of 8 and 8 references.*would fit the other", client.get_scene("sessions").contradiction)
+            re.search("groups of 6 and 6 references.*would fit the other", client.get_scene("sessions").contradiction)
             is not None
         )
     )
     (text,) = client.get_scene("sessions").warnings
     named = re.search(r"that of (\S+), (\S+), (\S+) would", text)
     assert named is not None
-    assert set(named.groups()) <= {it.name for it in ALL[1::2]}
+    assert set(named.groups()) <= {it.name for it in ALL[1:12:2]}
     numbers = re.search(r"scale (\S+), rotation by (\S+) degrees about \((.+?)\), translation \((.+?)\)", text)
     assert numbers is not None
     scale, angle_deg, axis, translation = (np.array([float(it) for it in part.split(",")]) for part in numbers.groups())

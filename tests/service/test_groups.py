@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime, timezone
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from mapless import (
     SequenceLocalization,
 )
 from mapless.axes import Axes, pose_to
+from mapless.calls import localization
 from mapless.geometry import rotation_from_vector
 
 CORNER = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
@@ -126,8 +128,10 @@ def test_soft_priors_of_another_place_do_not_cost_the_answer(corner: Client, que
 
 
 @pytest.mark.parametrize("axes", ["", "unity"])
-def test_a_sequence(corner: Client, queries: list[bytes], axes: str) -> None:
+def test_a_sequence(corner: Client, queries: list[bytes], axes: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the device tracks after it is put into the world, in its own axes and its own unit."""
+    parse = Mock(wraps=localization.sequence_from_message)
+    monkeypatch.setattr(localization, "sequence_from_message", parse)
     name = Axes(axes or "opencv")
     session_from_world = RigidTransform(rotation_from_vector([0.1, -0.3, 0.2]), np.array([3.0, 1.0, -2.0]))
 
@@ -150,6 +154,8 @@ def test_a_sequence(corner: Client, queries: list[bytes], axes: str) -> None:
     now = answer.world_from_session.transform_pose(tracked(WALK[-1]))
     assert_pose_close(now, pose_to(name, answer.world_from_camera[-1]), metres=1e-6, degrees=1e-4)
     assert [report.rejected_alone for report in answer.images] == [None] * 4
+    poses = parse.call_args.args[0].localization.poses
+    assert [it.HasField("capture_time") for it in poses] == [False, False, True, False]
 
 
 def test_a_jump_of_the_tracking_is_reported(corner: Client, queries: list[bytes]) -> None:

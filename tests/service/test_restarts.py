@@ -73,7 +73,9 @@ def calling(
     assert not failed
 
 
-@pytest.mark.parametrize(("how", "connect"), [(signal.SIGTERM, awaiting), (signal.SIGKILL, Client)])
+@pytest.mark.parametrize(
+    ("how", "connect"), [pytest.param(signal.SIGTERM, awaiting, marks=pytest.mark.nightly), (signal.SIGKILL, Client)]
+)
 def test_no_call_fails_while_the_only_server_is_away(tmp_path: Path, how: signal.Signals, connect: Connect) -> None:
     port = free_port()
     with ExitStack() as stack:

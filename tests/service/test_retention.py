@@ -125,7 +125,8 @@ def photograph(angle_deg: float) -> bytes:
     return marked(corner.photograph(corner.pose(angle_deg, -1.5)), str(angle_deg))
 
 
-GOOD = [photograph(angle) for angle in (-5.0, 3.0)]
+ANGLES = (-5.0, 3.0)
+GOOD = [photograph(angle) for angle in ANGLES]
 BLANK = marked(encode(".png", np.full((384, 512, 3), 90, np.uint8)), "blank")
 ELSEWHERE = marked(encode(".png", textured(512, 384, seed=9)), "elsewhere")
 REFUSED = photograph(1.0)
@@ -176,12 +177,11 @@ def ask_everything(address: str) -> None:
             client.localize(GOOD[1], camera, "corner", ["r0", "r8"], include_debug=True), LocalizationResult
         )
         assert isinstance(client.localize(BLANK, camera, "corner"), Rejected)
-        assert isinstance(client.localize(ELSEWHERE, camera, "corner"), Rejected)
+        assert isinstance(client.localize(ELSEWHERE, camera, "corner", variant="full"), Rejected)
         assert [it.is_final for it in stub.LocalizeProgressively(request(GOOD[0]), timeout=60)][-1]
-        client.localize_rig([RigImage(photo, camera, corner.pose(i)) for i, photo in enumerate(GOOD)], "corner")
-        client.localize_sequence(
-            [SequenceFrame(photo, camera, corner.pose(4 * i)) for i, photo in enumerate(GOOD)], "corner"
-        )
+        posed = [(photo, camera, corner.pose(angle, -1.5)) for photo, angle in zip(GOOD, ANGLES, strict=True)]
+        client.localize_rig([RigImage(*it) for it in posed], "corner")
+        client.localize_sequence([SequenceFrame(*it) for it in posed], "corner")
         assert client.retrieve_references(GOOD[0], camera, "corner", 2)
         assert len(list(client.audit_scene("corner"))) == len(REFERENCE_ANGLES)
         client.check_coverage("corner", corner.pose(2.0), camera)
