@@ -209,6 +209,12 @@ def test_a_wrong_field_is_rejected_by_name(field: str, fields: dict[str, Any]) -
     assert error.value.field == field
 
 
+def test_a_rotation_too_sure_is_named_with_its_sigma() -> None:
+    sure = np.diag([0.01] * 3 + [1e-12, 0.01, 0.01]).ravel().tolist()
+    with pytest.raises(FieldError, match=r"1\.7e-05 to 6\.28 radians, has 1e-06 to 0\.1"):
+        priors_from_message(request(posePrior={"worldFromCamera": IDENTITY, "covariance": {"rowMajor": sure}}), NOTHING)
+
+
 def test_a_certain_geo_position_without_a_height_is_a_prior() -> None:
     _, priors = priors_from_message(request(geoPositionPrior=GEO | {"horizontalSigmaM": 1e-4}), ON_EARTH)
     assert priors.position is not None
