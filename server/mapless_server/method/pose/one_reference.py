@@ -22,7 +22,7 @@ from ..bundle.dispersion import scale_covariance
 from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, ReconstructedView, View
-from ..optim.optimize import cauchy_weight, motion_jacobian, perturbed, world_covariance
+from ..optim.optimize import cauchy_weight, motion_jacobian, perturbed, solve_step, world_covariance
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import MetricScale, PixelPoints, PointMatches, Structure
@@ -193,7 +193,10 @@ def _solve(problem: _Problem, initial: RigidTransform) -> _Solved:
 
 
 def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
-    """Refines a pose by Gauss-Newton with a Cauchy loss, and estimates both errors from the inliers."""
+    """Refines a pose by Gauss-Newton with a Cauchy loss, and estimates both errors from the inliers.
+
+    Not by `minimize`: the errors, and with them the cost, change after each step.
+    """
     sigma_px, depth_sigma = FIRST_SIGMA_PX, FIRST_DEPTH_SIGMA
     for iteration in range(ITERATIONS):
         rows = _linearize(problem, pose)
@@ -201,9 +204,9 @@ def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
         information = rows.information(sigma_px, depth_sigma) * cauchy_weight(distance**2, 2.0)[:, None, None]
         hessian = np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose)
         gradient = np.einsum("mia,mij,mj->a", rows.by_pose, information, rows.residual)
-        if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
+        step = solve_step(hessian, gradient, least_norm=True)
+        if step is None:
             break
-        step = -np.linalg.pinv(hessian, hermitian=True) @ gradient
         pose = perturbed(pose.inverse(), step).inverse()
         inliers = distance < INLIER_SIGMA
         if iteration >= 2 and inliers.sum() >= MIN_INLIERS:
