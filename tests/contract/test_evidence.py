@@ -56,7 +56,8 @@ def test_every_page_is_measured_by_a_program_or_says_it_is_not() -> None:
     measured = set()
     for path in EVIDENCE:
         (command,) = re.findall(r"^\*\*Command\.\*\* (.*(?:\n.+)*)", path.read_text(), re.MULTILINE)
-        if re.match(rf"`make evidence KEY={path.stem}(?: DATA=\S+)?`, \d{{4}}-\d\d-\d\d, [0-9a-f]{{8}}", command):
+        options = r"(?: DATA=\S+)?(?: ARGS='--sample \d+')?"
+        if re.match(rf"`make evidence KEY={path.stem}{options}`, \d{{4}}-\d\d-\d\d, [0-9a-f]{{8}}", command):
             measured.add(path.stem)
         else:
             assert re.match(r"none: measured at [0-9a-f]{8}|`[^`]*python -m bench[\w.]* ", command), path.name
@@ -118,6 +119,8 @@ def test_a_page_keeps_its_text_and_gets_a_new_table() -> None:
     [
         (["no-such-key"], "invalid choice"),
         (["accusation-chance", "--nothing"], "unrecognized arguments"),
+        (["same-place", "--sample", "0"], "must be at least 1, is 0"),
+        (["same-place", "OTHER", "--sample", "1"], "none of the scenes"),
         (["accusation-chance", "EMPTY"], "has no scenes"),
         (["accusation-chance", "EMPTY/absent"], "has no scenes"),
         (["same-place", "OTHER"], "none of the scenes"),

@@ -2,7 +2,12 @@
 
 import argparse
 import importlib
+import tempfile
 from pathlib import Path
+
+import numpy as np
+
+from research.places import Scenes
 
 from .page import PAGES, Measurement, rewritten
 
@@ -24,7 +29,7 @@ MODULES = {
     "mask_margin": ("mask-margin",),
     "scene_agreement": ("scene-agreement",),
     "rungs": ("rungs",),
-    "readings": ("readings",),
+    "readings": ("readings", "suspects"),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }
 """The keys of each module, by its MEASUREMENTS; a module is imported when one of them is measured."""
@@ -39,17 +44,30 @@ def measurement_of(key: str) -> Measurement:
     return found
 
 
+def sampled(scenes: Path, count: int, folder: Path) -> Path:
+    """A folder with links to so many of the scenes, evenly spread by their names."""
+    names = Scenes(scenes).names
+    for i in np.unique(np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)):
+        link = folder / names[i]
+        link.parent.mkdir(exist_ok=True)
+        link.symlink_to((scenes / names[i]).resolve())
+    return folder
+
+
 def main() -> None:
     """Measures a key, or prints the keys; wrong usage, and a folder that lacks scenes, end with exit code 2."""
     parser = argparse.ArgumentParser(prog="python -m research.evidence", description=__doc__)
     parser.add_argument("key", nargs="?", choices=KEYS, metavar="KEY", help="without one, the keys are printed")
     parser.add_argument("scenes", nargs="?", type=Path, default=DATA, help="folder of the scenes' folders")
+    parser.add_argument("--sample", type=int, metavar="N", help="measure N of the scenes, evenly spread by their names")
     parser.add_argument("--print", action="store_true", help="print the table and leave the page as it is")
     arguments = parser.parse_args()
     if arguments.key is None:
         print("\n".join(KEYS))
         return
     key, scenes = arguments.key, arguments.scenes
+    if arguments.sample is not None and arguments.sample < 1:
+        parser.error(f"--sample must be at least 1, is {arguments.sample}")
     measurement, page = measurement_of(key), PAGES / f"{key}.md"
     if not page.is_file():
         parser.error(f"write the question, data and decision first: {page} does not exist")
@@ -57,14 +75,16 @@ def main() -> None:
         parser.error(f"{scenes} has no scenes, folders with images/ and cameras.json")
     rows = []
     try:
-        for row in measurement.rows(scenes):
-            print(*row.values(), sep=" | ", flush=True)
-            rows.append(row)
+        with tempfile.TemporaryDirectory() as linked:
+            measured = scenes if arguments.sample is None else sampled(scenes, arguments.sample, Path(linked))
+            for row in measurement.rows(measured):
+                print(*row.values(), sep=" | ", flush=True)
+                rows.append(row)
         if not rows:
             parser.error(f"{scenes} has none of the scenes that {key} is measured with")
         is_usual = not measurement.needs_scenes or scenes.resolve() == DATA.resolve()
         # Only now: a page never has a part of its table.
-        text = rewritten(page.read_text(), key, rows, "" if is_usual else scenes.resolve().name)
+        text = rewritten(page.read_text(), key, rows, "" if is_usual else scenes.resolve().name, arguments.sample)
     except (OSError, ValueError) as error:
         parser.error(str(error))
     if measurement.decide is not None:

@@ -70,10 +70,11 @@ def table(rows: Sequence[Row]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def rewritten(text: str, key: str, rows: Sequence[Row], data: str = "") -> str:
+def rewritten(text: str, key: str, rows: Sequence[Row], data: str = "", sample: int | None = None) -> str:
     """A page's text with the command, today's date, the commit, and the first table after them.
 
-    `data` is the name of the folder of scenes, if it is not the usual one. ValueError if the page has no line
+    `data` is the name of the folder of scenes, if it is not the usual one, `sample` the number of them that were
+    measured, if not all. ValueError if the page has no line
     "**Command.**".
     """
     command = _COMMAND.search(text)
@@ -83,7 +84,7 @@ def rewritten(text: str, key: str, rows: Sequence[Row], data: str = "") -> str:
     found = _TABLE.search(after)
     begin, end = found.span() if found is not None else (0, 0)
     after = after[:begin] + table(rows) + ("" if found is not None else "\n") + after[end:]
-    where = f" DATA={data}" if data else ""
+    where = (f" DATA={data}" if data else "") + (f" ARGS='--sample {sample}'" if sample else "")
     return f"{before}**Command.** `make evidence KEY={key}{where}`, {date.today().isoformat()}, {_commit()}.\n\n{after}"
 
 
