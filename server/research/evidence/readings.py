@@ -17,8 +17,14 @@ from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.extractors import make_extractor
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.pairs.readings import alignment, errors, explanation, repeats, rounding, sessions, verdict
-from mapless_server.method.pairs.readings.errors import MatchedPair, Views, consistent, distinct_matches
-from mapless_server.method.pairs.readings.verdict import Verdict, judge
+from mapless_server.method.pairs.readings.errors import (
+    MatchedPair,
+    Views,
+    consistent,
+    distinct_matches,
+    errors_of,
+)
+from mapless_server.method.pairs.readings.verdict import Verdict, judge, suspects_of
 from mapless_tools.ingest.formats.cameras import read_folder
 from research.places import Scenes
 
@@ -147,4 +153,31 @@ def _rows(folder: Path) -> Iterator[Row]:
         }
 
 
-MEASUREMENTS = {"readings": Measurement(_rows)}
+def moved(views: Views, i: int) -> Views:
+    """One photograph is turned by some degrees, and moved by about a tenth of the extent."""
+    random, pose = np.random.default_rng(i), views[i].world_from_camera
+    extent = np.ptp([it.world_from_camera.translation for it in views.values()], axis=0).max()
+    turn = rotation_from_vector(np.radians(random.normal(0.0, 3.0, 3)))
+    shift = random.normal(0.0, 0.1 * extent, 3)
+    return _with_poses(views, {i: RigidTransform(turn @ pose.rotation, pose.translation + shift)})
+
+
+def _suspects(folder: Path) -> Iterator[Row]:
+    """Poses as they are, and with every third photograph's wrong, one at a time."""
+    places = list(_places(Scenes(folder)))
+    right = [errors_of(it.views, it.matched) for it in places]
+    wrong = [(i, errors_of(moved(it.views, i), it.matched)) for it in places for i in list(it.views)[::3]]
+    wrong = [(i, its) for i, its in wrong if any(i in it.pair for it in its)]
+    for share in (0.01, 0.02, 0.025, 0.03, 0.04, 0.05):
+        with patch.object(verdict, "RIGHT_BAD_SHARE", share):
+            named = [(i, suspects_of(its)) for i, its in wrong]
+            accused = sum(bool(suspects_of(its)) for its in right)
+        yield {
+            "share": f"**{share:g}**" if share == verdict.RIGHT_BAD_SHARE else f"{share:g}",
+            f"of {len(right)} right scenes: a photograph named": accused,
+            f"of {len(wrong)} wrong poses: named": sum(i in found for i, found in named),
+            "others named beside": sum(bool({*found} - {i}) for i, found in named),
+        }
+
+
+MEASUREMENTS = {"readings": Measurement(_rows), "suspects": Measurement(_suspects)}

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from mapless.geometry import Quaternion, RigidTransform, Similarity, rotation_fr
 from mapless_server.method.features.views import Features, PosedView, View
 from mapless_server.method.pairs.epipolar import sampson_px
 from mapless_server.method.pairs.readings.alignment import align
-from mapless_server.method.pairs.readings.errors import MatchedPair, consistent, distinct_matches, errors_of
+from mapless_server.method.pairs.readings.errors import MatchedPair, PairError, consistent, distinct_matches, errors_of
 from mapless_server.method.pairs.readings.rounding import steps_of
 from mapless_server.method.pairs.readings.verdict import Verdict, judge, suspects_of
 
@@ -266,6 +267,22 @@ def test_a_single_wrong_pose_is_named_and_the_others_are_not() -> None:
     )
     verdict = verdict_of([replace(v, world_from_camera=wrong) if i == 5 else v for i, v in enumerate(views)], pairs)
     assert (verdict.is_wrong, verdict.suspects) == (False, (5,))
+
+
+@pytest.mark.parametrize(("right", "bad", "is_named"), [(8, 1, 0), (8, 2, 0), (12, 2, 0), (8, 3, 1), (8, 8, 1)])
+def test_few_bad_pairs_accuse_no_photograph(right: int, bad: int, is_named: bool) -> None:
+    """All pairs of the last photograph are bad, all others good: chance makes one or two, but not three."""
+    errors = [PairError(pair, 0.5, 3.0, 100) for pair in combinations(range(right), 2)]
+    errors += [PairError((i, right), 30.0, 3.0, 100) for i in range(bad)]
+    assert suspects_of(errors) == ((right,) if is_named else ())
+
+
+def test_pairs_that_are_bad_everywhere_accuse_no_photograph() -> None:
+    """Where a third of the others' pairs are bad, too, four bad ones are no surprise."""
+    others = list(combinations(range(8), 2))
+    errors = [PairError(pair, 30.0 if i % 3 == 0 else 0.5, 3.0, 100) for i, pair in enumerate(others)]
+    errors += [PairError((i, 8), 30.0, 3.0, 100) for i in range(4)]
+    assert 8 not in suspects_of(errors)
 
 
 def test_without_pairs_nothing_is_known() -> None:

@@ -10,6 +10,8 @@ What intrinsics are accused by, and of how many alternatives:
     an estimated error of a parameter, times `HEAVY_TAIL`            4 parameters        `bundle.intrinsics`
     what a pose of another camera gains, keypoint by keypoint        cameras tried       `judge.cameras`, `judge.hints`
     the focal length that a reference's neighbours give              1                   `scenes.audit.comparison`
+
+So are the poses of photographs of which too many pairs are bad (`pairs.readings.verdict`).
 """
 
 import math
@@ -19,7 +21,7 @@ import numpy as np
 from mapless.geometry import Array
 
 MAX_LOG10_CHANCE = -4.0
-"""Largest log10 of the expected number of accusations of right intrinsics by one test. Evidence: accusation-chance."""
+"""Largest log10 of the expected number of accusations of what is right by one test. Evidence: accusation-chance."""
 
 HEAVY_TAIL = 1.47
 """Factor on the standard deviations of estimated errors, which are right at 68 %: the tails are heavier than those of a

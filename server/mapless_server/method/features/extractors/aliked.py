@@ -25,6 +25,9 @@ _CORNERS = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
 _UNLIMITED = 2**31
 """More keypoints than any image has."""
 
+_REACH = 0.25
+"""Largest offset of a sampled position, as a share of the map's longer side."""
+
 _AT_ONCE = 256
 """Keypoints that are described at once, with 20 MB."""
 
@@ -144,7 +147,7 @@ def find_maps(network: ALIKED, image: torch.Tensor) -> Maps:
 def describe(head: SDDH, maps: Maps, keypoints: torch.Tensor) -> torch.Tensor:
     """Descriptors (N, D) of keypoints (N, 2), which are -1 to 1 in the image: the numbers of `SDDH` to rounding."""
     size = _size(maps.scores)
-    limit = float(size.max()) / 4
+    limit = _REACH * float(size.max())
     side = torch.arange(head.kernel_size, device=size.device)
     around = torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1)
     descriptors = []
@@ -180,7 +183,7 @@ def _deformed(layer: nn.Module, x: torch.Tensor) -> torch.Tensor:
     height, width = x.shape[2:]
     weight = layer.regular_conv.weight
     side = weight.shape[-1]
-    limit = max(height, width) / 4
+    limit = _REACH * max(height, width)
     offsets = layer.offset_conv(x).clamp(-limit, limit).view(side, side, 2, height, width)
     across, down, kernel = (torch.arange(n, dtype=x.dtype, device=x.device) for n in (width, height, side))
     columns = offsets[:, :, 1] + across + (kernel - layer.padding)[:, None, None]

@@ -6,12 +6,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import bdtrc
 
+from ...bundle.significance import MAX_LOG10_CHANCE
 from ..agreement import MAX_ERROR_PX
 from .depth import median_depth
 from .errors import FEW_SHARE, WRONG_SHARE, MatchedPair, Pair, PairError, Views, errors_of, summary
 from .explanation import explain
 from .repeats import contradicting_groups, same_photographs
+
+RIGHT_BAD_SHARE = 0.025
+"""Share of the pairs of right poses that are bad: repeated structure gives consistent wrong matches. Evidence:
+suspects."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +83,24 @@ def judge(
 
 
 def suspects_of(errors: Sequence[PairError]) -> tuple[int, ...]:
-    """Photographs almost all of whose pairs are bad, the worst first; its pairs then do not count against others."""
+    """Photographs almost all of whose pairs are bad, the worst first; its pairs then do not count against others.
+
+    They are more than chance makes bad: under the null hypothesis the pose is right, and each of its pairs is bad with
+    the chance that the others' pairs show, and `RIGHT_BAD_SHARE` before any is seen.
+    """
     left = list(errors)
     suspects: list[int] = []
+    photographs = {i for error in errors for i in error.pair}
     while True:
         total = Counter(i for error in left for i in error.pair)
         bad = Counter(i for error in left if error.is_bad for i in error.pair)
-        doubtful = [i for i in bad if bad[i] >= 2 and bad[i] >= (1 - WRONG_SHARE) * total[i]]
+        doubtful = []
+        for i in bad:
+            others, their_bad = len(left) - total[i], sum(error.is_bad for error in left) - bad[i]
+            chance = bdtrc(bad[i] - 1, total[i], (their_bad + 1) / (others + 1 / RIGHT_BAD_SHARE))
+            is_chance = chance > 0 and math.log10(len(photographs) * chance) > MAX_LOG10_CHANCE
+            if bad[i] >= (1 - WRONG_SHARE) * total[i] and not is_chance:
+                doubtful.append(i)
         if not doubtful:
             return tuple(suspects)
         worst = max(doubtful, key=lambda i: (bad[i] / total[i], bad[i], -i))
