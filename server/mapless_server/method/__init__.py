@@ -3,6 +3,7 @@
 Begin with `localize`, then `solve` and `ladder`. A room imports only rooms above it in this list, which has no circle:
 
 rejection        "no pose" is a result
+significance     how surely something contradicts what is given
 optim/           Levenberg-Marquardt, robust losses, small motions of poses
 features/        features of photographs, their matches, tracks
 pairs/           matches of posed photographs; whether photographs agree with their poses, and why not if not

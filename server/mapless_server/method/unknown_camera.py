@@ -29,7 +29,6 @@ from .bundle.adjust import LEAST_MATCHES
 from .bundle.intrinsics import DOUBTED_SIGMAS, read_as
 from .bundle.pose_problem import AdjustOptions
 from .bundle.priors import IntrinsicsSigma
-from .bundle.significance import is_significant, sigmas_of_gains
 from .features.limits import INEXACT_INLIER_PX
 from .features.views import PosedView, View
 from .judge.cameras import BY_POINTS, LINES, PNP
@@ -39,6 +38,7 @@ from .pairs.correspond import Correspondences
 from .pose.pnp import MIN_MATCHES, ransac
 from .pose.relative import Evidence, find_pose, scores_by_keypoint
 from .pose.two_view_matches import TwoViewMatches
+from .significance import is_significant, sigmas_of_gains
 from .structure.match import vote
 from .structure.structure import StructureOptions, triangulated_structure
 

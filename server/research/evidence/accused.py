@@ -17,7 +17,7 @@ import numpy as np
 from mapless.geometry import Camera
 from mapless.lenses import RadialTangential
 from mapless_server.images import ImageLimits, decode_image
-from mapless_server.method.bundle import significance
+from mapless_server.method import significance
 from mapless_server.method.bundle.intrinsics import ContradictionOptions
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import make_extractor

@@ -18,9 +18,9 @@ from scipy.special import gammaincinv
 from mapless.geometry import Array, RigidTransform
 
 from ..features.views import Matches, PosedView, ReferenceErrors, View
+from ..significance import HEAVY_TAIL
 from ..structure.model import PointMatches, Structure
 from .priors import IntrinsicsSigma, PriorCheck
-from .significance import HEAVY_TAIL
 
 if TYPE_CHECKING:  # services do not load what computes
     from .intrinsics import IntrinsicsEvidence

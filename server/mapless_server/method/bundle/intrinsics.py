@@ -26,8 +26,8 @@ from mapless.lenses import Distortion, RadialTangential
 from mapless_server.bounds import check_bounds
 
 from ..features.views import View, undistort_pixels
+from ..significance import HEAVY_TAIL, least_sigmas
 from .priors import IntrinsicsSigma
-from .significance import HEAVY_TAIL, least_sigmas
 
 PRINCIPAL = (1, 2)
 """Indices of the principal point among the four errors."""

@@ -12,7 +12,7 @@ agree with one pose of a camera that is nearer to the true one. So poses are com
 values of k1, without the lens, and, where these are unusual, with the principal point in the centre and with square
 pixels; the score of `pose.relative` compares them, by points and by matches without points together.
 
-A camera is accused only if that is significant (`bundle.significance`): if the keypoints that score higher with another
+A camera is accused only if that is significant (`significance`): if the keypoints that score higher with another
 camera outweigh those that score lower by more than chance, with the best poses of both cameras that are found from all
 matches. A pose that is explained clearly worse than one of another camera is rejected also where that is not
 significant, for lack of evidence.
@@ -31,13 +31,13 @@ from ..bundle.adjust import LEAST_MATCHES
 from ..bundle.estimate import PosedSupport, Support
 from ..bundle.intrinsics import DOUBTED_SIGMAS, ContradictionOptions, IntrinsicsEvidence, corrected, read_as
 from ..bundle.priors import IntrinsicsSigma
-from ..bundle.significance import is_significant, sigmas_of_gains
 from ..features.views import View
 from ..pose import pnp
 from ..pose.pnp import PnpOptions, ransac
 from ..pose.relative import Evidence, RelativePoseOptions, find_pose, scores_by_keypoint
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
+from ..significance import is_significant, sigmas_of_gains
 
 
 def intrinsics_checks(evidence: IntrinsicsEvidence) -> tuple[IntrinsicsCheck, ...]:

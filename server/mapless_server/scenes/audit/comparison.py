@@ -12,13 +12,13 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage
-from mapless_server.method.bundle.significance import least_sigmas
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.judge.judge import JudgeOptions, judge
 from mapless_server.method.optim.optimize import world_covariance
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pairs.readings.repeats import pose_difference
 from mapless_server.method.pose.pnp import MIN_MATCHES, PnpOptions, false_alarms, ransac
+from mapless_server.method.significance import least_sigmas
 from mapless_server.method.structure.model import PixelPoints, PointMatches
 
 from .neighbourhood import Neighbourhood, PairMatches, build_neighbourhood, match_points, observed_points

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import bdtrc
 
-from ...bundle.significance import MAX_LOG10_CHANCE
+from ...significance import MAX_LOG10_CHANCE
 from ..agreement import MAX_ERROR_PX
 from .depth import median_depth
 from .errors import FEW_SHARE, WRONG_SHARE, MatchedPair, Pair, PairError, Views, errors_of, summary
