@@ -15,7 +15,7 @@ PROTO_VENV  := $(VENV)/proto-tools
 # processes compiles all that it imports: a server takes 3.0 s of processor time to start instead of 1.3.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lock test nightly weights lint format proto released demo bench bench-turns bench-gpu evidence load load-ray fuzz \
+.PHONY: help setup lock test nightly weights lint format proto released demo demo-video bench bench-turns bench-gpu evidence load load-ray fuzz \
     sbom release-images release-image reference docs clean
 
 help:  ## List the targets
@@ -87,8 +87,11 @@ released: setup  ## At a release: keep the interface that later ones must not br
 demo: setup  ## Localize photographs end to end; DATA=folder for real ones
 	$(BIN)/mapless-server demo $(if $(DATA),--data '$(DATA)')
 
-# The programs that measure are not installed.
+# The programs that measure, and the video of the room, are not installed.
 FROM_HERE := PYTHONPATH=client:server
+demo-video: setup  ## From a video of a room with a printed tag to localized photographs, judged against the rendered truth
+	$(FROM_HERE) $(BIN)/python -m research.rendered_room.demo demo-output/video
+
 bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder with the scenes
 	$(FROM_HERE) $(BIN)/python -m bench $(if $(DATA),'$(DATA)',../shared/data)
 

@@ -5,7 +5,7 @@ wall x = 0, the bookshelf stands at x = 5, the door is in the wall y = 0, the cu
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -129,10 +129,10 @@ class Room:
             self.outline += self.boxes[-1].edges()
 
 
-def lit_room(seed: int) -> Room:
-    """The furnished room, whose textures are the light that leaves them."""
+def lit_room(seed: int, *added: Callable[[Room], None]) -> Room:
+    """The furnished room, whose textures are the light that leaves them, with what is added to it last."""
     room = Room(np.random.default_rng([seed, 0]))
-    for part in (shell, table, bookshelf, sideboard, corners, wall_pictures):
+    for part in (shell, table, bookshelf, sideboard, corners, wall_pictures, *added):
         part(room)
     for quad in room.quads:
         light = np.asarray(cv2.pow(quad.levels[0], 2.2))

@@ -132,19 +132,37 @@ def shade(room: Room, camera: Camera, world_from_camera: RigidTransform) -> Floa
     return image
 
 
+class Settings(NamedTuple):
+    """What a phone does to the light: blur in pixels, exposure in stops, gains of red and blue, factor of the noise."""
+
+    blur_px: float
+    stops: float
+    red: float
+    blue: float
+    noise: float = 1.0
+
+
 def photograph(room: Room, station: Station, seed: int) -> NDArray[np.uint8]:
+    """(H, W, 3) sRGB, four rays a pixel, with random settings of a phone."""
+    random = np.random.default_rng([seed, 1, *station.name.encode()])
+    settings = Settings(
+        random.uniform(0.5, 1.0), random.normal(0, 0.45), 1 + random.normal(0, 0.08), 1 + random.normal(0, 0.08)
+    )
+    return developed(room, station, settings, random)
+
+
+def developed(room: Room, station: Station, settings: Settings, random: np.random.Generator) -> NDArray[np.uint8]:
     """(H, W, 3) sRGB, four rays a pixel, with what a phone does to the light: blur, exposure, vignetting, noise."""
     w, h = station.camera.width_px, station.camera.height_px
-    random = np.random.default_rng([seed, 1, *station.name.encode()])
     radiance = shade(room, station.camera.resized(2 * w, 2 * h), station.world_from_camera)
     radiance = np.asarray(cv2.resize(radiance, (w, h), interpolation=cv2.INTER_AREA), np.float32)
-    light = np.asarray(cv2.GaussianBlur(radiance, (0, 0), random.uniform(0.5, 1.0)), np.float32)
-    gain = 0.24 / float(np.mean(np.minimum(light, 0.8))) * 2 ** random.normal(0, 0.45)
-    gains = gain * np.array([1 + random.normal(0, 0.08), 1, 1 + random.normal(0, 0.08)])  # white balance
+    light = np.asarray(cv2.GaussianBlur(radiance, (0, 0), settings.blur_px), np.float32)
+    gain = 0.24 / float(np.mean(np.minimum(light, 0.8))) * 2**settings.stops
+    gains = gain * np.array([settings.red, 1, settings.blue])  # white balance
     y, x = np.linspace(-1, 1, h, dtype=np.float32), np.linspace(-1, 1, w, dtype=np.float32)
     lost = 0.15 * (x[None, :] ** 2 + y[:, None] ** 2)
     light = light * (1 - lost[..., None]).astype(np.float32) * gains.astype(np.float32)
-    deviation = np.sqrt(0.03**2 * np.clip(light, 0, 1) + 0.006**2)
+    deviation = settings.noise * np.sqrt(0.03**2 * np.clip(light, 0, 1) + 0.006**2)
     light = np.clip(light + random.standard_normal(light.shape, np.float32) * deviation, 0, 1)
     screen = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.asarray(screen * 255 + 0.5, np.uint8)
