@@ -1,7 +1,9 @@
 """Photographs of a reconstruction's sources: which are used, in which order, and what is said of the others."""
 
 import io
+import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,7 +39,7 @@ def exif(orientation: int = 1, time: str = "") -> bytes:
     return tags.tobytes()
 
 
-def save(file: Path, image: NDArray[np.uint8], **parameters: object) -> Path:
+def save(file: Path, image: NDArray[np.uint8], **parameters: Any) -> Path:
     file.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(file, **parameters)
     return file
@@ -159,9 +161,12 @@ def test_unusable_files_are_named_with_the_reason(tmp_path: Path) -> None:
     save(folder / "tiny.png", scenery(3, (20, 20)))
     (folder / "notes.txt").write_text("no image")
     (folder / ".hidden.jpg").write_bytes(b"")
+    (folder / "gone.jpg").symlink_to("nowhere")
+    os.mkfifo(folder / "pipe.jpg")
     pictures = read(folder)
     assert [it.name for it in pictures.chosen] == ["good"]
-    assert set(reasons(pictures)) == {"empty.jpg", "text.png", "cut.jpg", "cut.heic", "a.tif", "raw.DNG", "tiny.png"}
+    unusable = {"empty.jpg", "text.png", "cut.jpg", "cut.heic", "a.tif", "raw.DNG", "tiny.png", "gone.jpg"}
+    assert set(reasons(pictures)) == unusable
 
 
 def test_too_large_photograph_is_named_with_the_bound(tmp_path: Path) -> None:

@@ -80,8 +80,9 @@ def is_heif(head: bytes) -> bool:
 
 def _files_of(source: Path, options: SourceOptions) -> Iterable[SourceFile]:
     try:
-        is_folder = source.is_dir()
-        if not is_folder:
+        if _is_special(source) and not source.is_dir():
+            raise ValueError(f"{printable(str(source))} is neither a file nor a folder")
+        if not source.is_dir():
             with source.open("rb"):
                 return [SourceFile(source, printable(source.name))]
     except OSError as error:
@@ -107,7 +108,12 @@ def _walk(source: Path, excluded: set[Path]) -> Iterator[Path]:
                 entered.add(resolved)
                 kept.append(name)
         inner[:] = kept
-        yield from (here / name for name in files if not _is_hidden(name))
+        yield from (here / name for name in files if not _is_hidden(name) and not _is_special(here / name))
+
+
+def _is_special(file: Path) -> bool:
+    """Whether a file is a pipe, a socket or a device: reading it may never end."""
+    return file.exists() and not file.is_file()
 
 
 def _is_hidden(name: str) -> bool:

@@ -82,7 +82,7 @@ def opened_video(file: Path, *, keys_only: bool = False) -> Iterator[Video]:
         try:
             container = av.open(data, "r", metadata_errors="replace", buffer_size=_BUFFER_BYTES)
         except (FFmpegError, OSError, ValueError) as error:
-            raise ValueError(f"it cannot be read as a video: {getattr(error, 'strerror', None) or error}") from error
+            raise ValueError(f"it cannot be read as a video: {_reason(file, error)}") from error
         with container:
             streams = [it for it in container.streams.video if not it.disposition & it.disposition.attached_pic]
             if not streams:
@@ -95,6 +95,17 @@ def opened_video(file: Path, *, keys_only: bool = False) -> Iterator[Video]:
             if keys_only:
                 stream.codec_context.skip_frame = "NONKEY"
             yield Video(container, stream)
+
+
+def _reason(file: Path, error: Exception) -> str:
+    """Why a file cannot be opened, for people."""
+    with file.open("rb") as data:
+        head = data.read(8)
+    if not head:
+        return "it is empty"
+    if head[4:] == b"ftyp":
+        return "its index is missing, as in recordings that were cut off before their end"
+    return str(getattr(error, "strerror", None) or error)
 
 
 def small_grey(frame: VideoFrame, size_px: tuple[int, int]) -> NDArray[np.uint8]:
@@ -124,8 +135,8 @@ def upright_picture(frame: VideoFrame, pixel_aspect: float) -> NDArray[np.uint8]
 
 def display_matrix(frame: VideoFrame) -> NDArray[np.float64]:
     """The matrix (2, 2) that takes directions (x, y) of the stored frame to those of the shown one; no unit."""
-    for i in range(len(frame.side_data)):
-        it = frame.side_data[i]
+    side_data: Any = frame.side_data  # is annotated with one of its kinds
+    for it in side_data:
         if it.type.name == "DISPLAYMATRIX":
             a, b, _, c, d = np.frombuffer(bytes(it), np.int32)[:5] / 2**16
             return np.array([[a, c], [b, d]])

@@ -78,10 +78,10 @@ def _watched(
     progress: Progress,
 ) -> Watched | Omitted:
     """What a video shows, or why it takes no part."""
-    copied = next((it for it in earlier if filecmp.cmp(it.path, file.path, shallow=False)), None)
-    if copied:
-        return Omitted(file.name, f"it has the same bytes as {copied.name}")
     try:
+        copied = next((it for it in earlier if filecmp.cmp(it.path, file.path, shallow=False)), None)
+        if copied:
+            return Omitted(file.name, f"it has the same bytes as {copied.name}")
         if (file.path.parent, file.path.stem.casefold()) in beside and _duration_s(file.path) < _LIVE_S:
             return Omitted(file.name, "it is the moving part of the photograph beside it")
         key = f"{identity(file.path)} {options.frames}"
