@@ -1,8 +1,10 @@
 """A scene's attributes through a real server: set, changed, cleared, and refused by field."""
 
+import asyncio
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support.servers import CAMERA, PHOTO, Stubs, make_scene, pose, serving
@@ -164,3 +166,22 @@ def test_what_is_deleted_leaves_the_memory(tmp_path: Path, monkeypatch: pytest.M
         with pytest.raises(NotFound):
             client.delete_scene("s")
     assert heard == [{keys["r1"]}, {keys["r0"], keys["r2"]}, scene_key, scene_key]
+
+
+def test_coverage_is_of_one_unit_though_it_changes_meanwhile(tmp_path: Path) -> None:
+    """The scene's unit is changed while its coverage is computed: it is computed again, and stated in the new unit."""
+    with serving(tmp_path) as server, Client(server.address) as client:
+        client.create_scene("s")
+        usual, asked = server.engine.check_coverage, 0
+
+        async def changing(*arguments: Any) -> Any:
+            nonlocal asked
+            asked += 1
+            found = await usual(*arguments)
+            if asked == 1:
+                await asyncio.to_thread(client.update_scene, "s", arbitrary_unit=True)
+            return found
+
+        server.engine.check_coverage = changing  # type: ignore[method-assign]
+        assert client.check_coverage("s", pose(0.0), CAMERA).arbitrary_unit
+    assert asked == 2
