@@ -16,6 +16,7 @@ from .features import FeatureFolder
 from .matching import SEED
 from .native import interruptible
 from .pictures import Omitted, Part, Picture, PosedPicture
+from .turning import only_turned
 
 FEWEST = 3
 """Photographs of a part: with two nothing confirms their poses."""
@@ -62,11 +63,12 @@ def map_photographs(database: Path, folder: Path, count: int, threads: int, prog
     progress("poses", count, count)
 
 
-def read_parts(folder: Path, pictures: Sequence[Picture], features: FeatureFolder) -> tuple[Part, ...]:
+def read_parts(database: Path, folder: Path, pictures: Sequence[Picture], features: FeatureFolder) -> tuple[Part, ...]:
     """The models of a folder that have parallax, the one with most photographs first."""
     by_name = {it.name: it for it in pictures}
     models = [pycolmap.Reconstruction(str(it)) for it in sorted(folder.iterdir(), key=lambda it: int(it.name))]
-    parts = [_part(it, by_name, features) for it in models if _parallax_deg(it) >= PARALLAX_DEG]
+    moved = [it for it in models if not only_turned(database, it.reg_image_ids())]
+    parts = [_part(it, by_name, features) for it in moved if _parallax_deg(it) >= PARALLAX_DEG]
     return tuple(sorted(parts, key=lambda it: -len(it.posed)))
 
 

@@ -86,9 +86,10 @@ class MatchFolder:
             progress("matches", done, len(pairs))
             file = self._folder / f"{first}.npz"
             if not file.is_file():
-                found = {second: self._matches(first, second) for second in others}
+                found = [self._matches(first, second) for second in others]
+                ends = np.cumsum([len(it) for it in found])
                 with whole_file(file) as partial, partial.open("wb") as stream:
-                    np.savez(stream, **found)
+                    np.savez(stream, names=np.array(others), ends=ends, matches=np.concatenate(found))
             done += len(others)
         progress("matches", done, len(pairs))
 
@@ -98,7 +99,8 @@ class MatchFolder:
         if not file.is_file():
             return {}
         with np.load(file) as arrays:
-            return dict(arrays)
+            found = np.split(arrays["matches"], arrays["ends"][:-1])
+            return dict(zip(arrays["names"].tolist(), found, strict=True))
 
     def _matches(self, first: str, second: str) -> Matches:
         """Nearest descriptors that fit one fundamental matrix; pycolmap takes seconds to find that others do not."""

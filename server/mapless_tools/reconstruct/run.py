@@ -87,7 +87,7 @@ def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, pro
     with made_once(models) as made:
         if made is not None:
             map_photographs(database, made, len(chosen), available_cores(), progress)
-    parts = read_parts(models, chosen, features)
+    parts = read_parts(database, models, chosen, features)
     if not parts:
         raise ValueError(why_no_part(database, models))
     if options.part > len(parts):

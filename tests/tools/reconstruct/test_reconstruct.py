@@ -12,11 +12,16 @@ from typer.testing import CliRunner
 
 from mapless.cli.output import plain
 from mapless.geometry import Array
+from mapless_server.images import ANY_SIZE, decode_image
+from mapless_server.method.features.extractors import SiftExtractor, SiftOptions
+from mapless_server.scenes.retrieval.vlad import VladDescriptor, shipped
 from mapless_tools.cli.app import app
 from mapless_tools.demo.photographs import Photograph, room
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.metres import umeyama
 from mapless_tools.progress import Progress
+from mapless_tools.reconstruct.features import FeatureFolder
+from mapless_tools.reconstruct.matching import PairOptions, pairs_of
 from mapless_tools.reconstruct.output import write_folder
 from mapless_tools.reconstruct.run import (
     Reconstructed,
@@ -57,7 +62,7 @@ def errors(result: Reconstructed, truth: Sequence[Photograph]) -> Array:
 
 def half(it: Photograph, negative: bool = False) -> Photograph:
     """The photograph at half its size; its negative shows another room, whose light and dark are exchanged."""
-    image = cv2.imdecode(np.frombuffer(it.data, np.uint8), cv2.IMREAD_COLOR_RGB)
+    image = decode_image(it.data, ANY_SIZE)
     reduced = np.asarray(cv2.resize(image, (480, 360), interpolation=cv2.INTER_AREA), np.uint8)
     name = f"negative-{it.name}" if negative else it.name
     data = encode(".png", 255 - reduced if negative else reduced)
@@ -128,15 +133,35 @@ def test_two_places_become_two_parts(tmp_path: Path, chosen: Sequence[Photograph
         reconstructed(source, tmp_path / "out", replace(OPTIONS, part=3))
 
 
+def test_neighbours_and_similar_ones_suffice(source: Path, out: Path, result: Reconstructed) -> None:
+    pairs = PairOptions(all_below=0, steps=(1,), similar=2)
+    fewer = reconstructed(source, out, replace(OPTIONS, pairs=pairs))
+    assert fewer.parts == result.parts
+    for one, other in zip(fewer.part.posed, result.part.posed, strict=True):
+        assert one.picture.name == other.picture.name
+
+
+def test_pairs_of_many_are_distinct_and_include_neighbours(source: Path, tmp_path: Path) -> None:
+    pictures = read_sources([source], tmp_path, SourceOptions(), silent).chosen
+    features = FeatureFolder(tmp_path / "features", SiftExtractor(SiftOptions(max_keypoints=50)), pictures)
+    features.extract(silent)
+    names = [it.name for it in pictures]
+    options = PairOptions(all_below=3, steps=(2,), similar=1)
+    pairs = pairs_of(names, features, VladDescriptor("sift", shipped("sift")), options, silent)
+    assert len(set(pairs)) == len(pairs) < len(names) * (len(names) - 1) / 2
+    assert all(names.index(first) < names.index(second) for first, second in pairs)
+    assert set(zip(names, names[2:], strict=False)) <= set(pairs)
+
+
 def test_turning_camera_gets_no_poses(tmp_path: Path) -> None:
     chosen = room().references[0]
-    image = cv2.imdecode(np.frombuffer(chosen.data, np.uint8), cv2.IMREAD_COLOR)
+    image = decode_image(chosen.data, ANY_SIZE)
     matrix = chosen.camera.matrix()
     turned = []
-    for degrees in range(-12, 13, 4):
+    for degrees in range(-8, 9, 4):
         turn = cv2.Rodrigues(np.radians([degrees / 3, degrees, 0.0]))[0]
         part = cv2.warpPerspective(image, matrix @ turn @ np.linalg.inv(matrix), (960, 720))
-        data = encode(".png", part[150:570, 200:760])
+        data = encode(".png", np.asarray(part[150:570, 200:760], np.uint8))
         turned.append(Photograph(f"turned{degrees}", data, chosen.camera, chosen.world_from_camera))
     with pytest.raises(ValueError, match="only to have turned"):
         reconstructed(photographs(tmp_path / "photos", turned), tmp_path / "out")
