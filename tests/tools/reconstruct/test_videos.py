@@ -1,5 +1,7 @@
 """Videos of a reconstruction's sources: which frames are chosen, and how they are written."""
 
+import subprocess
+import sys
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -190,6 +192,20 @@ def test_frames_that_are_sought_and_counted_are_the_same(tmp_path: Path, monkeyp
     file = file.rename(tmp_path / "other" / "a.mp4")
     for first, second in zip(sought, map(pixels, read(file).chosen), strict=True):
         assert np.array_equal(first, second)
+
+
+def test_full_disk_leaves_no_half_made_frame(tmp_path: Path) -> None:
+    file = write(tmp_path / "a.mp4", pan(np.arange(30) * 6.0))
+    program = (
+        "import resource, signal, sys; from pathlib import Path\n"
+        "from mapless_tools.reconstruct.sources import SourceOptions, read_sources\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))\n"
+        "read_sources([Path(sys.argv[1])], Path(sys.argv[2]), SourceOptions(), lambda *_: None)"
+    )
+    command = [sys.executable, "-c", program, str(file), str(tmp_path / "work")]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert "File too large" in ended.stderr
+    assert not [*(tmp_path / "work").rglob("*.jpg*")]
 
 
 @pytest.mark.parametrize("ending", ["mp4", "mkv", "mov", "webm", "avi", "ts"])
