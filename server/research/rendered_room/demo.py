@@ -5,21 +5,22 @@ The video is rendered by `video`, and has a printed tag of known size in it. Its
 which are of another camera and not of the video, are localized in it.
 """
 
+import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
-from mapless import Client, LocalizationResult, Rejected
-from mapless.geometry import RigidTransform, Similarity
+from mapless import Client
+from mapless.geometry import RigidTransform
 from mapless_tools.child import child_server
 from mapless_tools.demo.photographs import Outline, Place, room, split_folder
 from mapless_tools.demo.run import judge, summarize, table_of, write_pictures
+from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.metres import umeyama
 
 VIDEO = Path(__file__).with_name("walk.mp4")
@@ -41,11 +42,7 @@ def main(output: Path) -> bool:
         command("import", folder, SCENE, "--address", server.address)
         with Client(server.address) as client:
             answers = [client.localize(it.data, it.camera, SCENE, include_debug=True) for it in truth.queries]
-    found = world_from_room(truth, answers)
-    if found is None:
-        console.print(f"[red]expected: three of {len(answers)} photographs localized[/]")
-        return False
-    rigid, scale = found
+    rigid, scale = world_from_room(folder)
     place = moved(truth, rigid, split_folder(folder))
     outcomes = [judge(query, answer) for query, answer in zip(place.queries, answers, strict=True)]
     console.print(table_of(outcomes, metric=True))
@@ -62,23 +59,18 @@ def command(*arguments: object) -> None:
     subprocess.run([sys.executable, "-m", "mapless_tools", *map(str, arguments)], check=True)
 
 
-def world_from_room(
-    truth: Place, answers: Sequence[LocalizationResult | Rejected]
-) -> tuple[RigidTransform, float] | None:
+def world_from_room(folder: Path) -> tuple[RigidTransform, float]:
     """The motion from the rendered room to the reconstruction's world, and metres of that for one true metre.
 
-    Nothing says where the reconstruction's origin is in the room: the motion is fitted to the answers, without the
-    scale, which is the tag's. None if fewer than three photographs are localized.
+    Nothing says where the reconstruction's origin is in the room: the motion is fitted to the frames' true positions,
+    without the scale, which is the tag's.
     """
-    pairs = [
-        (query.world_from_camera.translation, answer.world_from_camera.translation)
-        for query, answer in zip(truth.queries, answers, strict=True)
-        if isinstance(answer, LocalizationResult)
-    ]
-    if len(pairs) < 3:
-        return None
-    true, found = (np.array([pair[i] for pair in pairs]) for i in (0, 1))
-    fitted: Similarity = umeyama(true, found)
+    truth = json.loads(VIDEO.with_suffix(".json").read_text("utf-8"))["world_from_camera"]
+    frames = read_folder(folder).frames
+    found = np.array([it.world_from_camera.translation for it in frames])
+    # Frames are named by their numbers: walk_000012.
+    true = np.array([truth[int(it.name.rpartition("_")[2])] for it in frames])[:, :, 3]
+    fitted = umeyama(true, found)
     return RigidTransform(fitted.rotation, found.mean(axis=0) - fitted.rotation @ true.mean(axis=0)), fitted.scale
 
 
