@@ -20,6 +20,7 @@ import grpc
 import numpy as np
 import psycopg
 import pytest
+from numpy.typing import NDArray
 from support import corner
 from support.images import encode, textured
 from support.postgres import shared_cluster
@@ -51,6 +52,7 @@ RUN_BYTES = 16
 """So many bytes in a row, of anything that was sent, are a leak: by chance nothing has them."""
 ARRAY_RUN_BYTES = 64
 """The same of pixels and features, whose numbers are small and few: references, which are stored, have alike ones."""
+HASH_BITS = 22
 REFERENCE_ANGLES = (-8, 0, 8)
 
 
@@ -86,16 +88,20 @@ class Search:
         # Pieces of few different bytes say nothing: plain walls look alike, and most numbers of a descriptor are zero.
         self._of_arrays = _pieces(pixels, 8) | _pieces(features, 16)
         assert min(len(self._of_photos), len(self._of_arrays)) > 1000
-        beginnings = self._of_photos | {it[:8] for it in self._of_arrays}
+        # Zeros say nothing either: files have pages of them.
+        beginnings = (self._of_photos | {it[:8] for it in self._of_arrays}) - {bytes(8)}
         self._beginnings = np.sort(np.frombuffer(b"".join(beginnings), np.uint64))
+        self._hashes = np.zeros(2**HASH_BITS, bool)
+        self._hashes[_hash(self._beginnings)] = True
 
     def find(self, data: bytes) -> bool:
         """Whether it holds any of it."""
         padded = np.frombuffer(data + bytes(8), np.uint8)
         for offset in range(min(8, len(data))):
             words = padded[offset : offset + (len(data) - offset) // 8 * 8].view(np.uint64)
-            places = np.searchsorted(self._beginnings, words).clip(max=len(self._beginnings) - 1)
-            candidates = 8 * np.flatnonzero(self._beginnings[places] == words) + offset
+            likely = np.flatnonzero(self._hashes[_hash(words)])  # few, so that large files take no long search
+            places = np.searchsorted(self._beginnings, words[likely]).clip(max=len(self._beginnings) - 1)
+            candidates = 8 * likely[self._beginnings[places] == words[likely]] + offset
             if any(self._is_found(data, at) for at in candidates.tolist()):
                 return True
         return False
@@ -112,6 +118,10 @@ class Search:
         """Files with something of it, anywhere in a folder."""
         paths = sorted(it for it in folder.rglob("*") if it.is_file() and not it.is_symlink())
         return [str(it.relative_to(folder)) for it in paths if self.find(it.read_bytes())]
+
+
+def _hash(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    return (words * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(64 - HASH_BITS)
 
 
 def _pieces(arrays: Sequence[bytes], different: int) -> set[bytes]:
