@@ -126,7 +126,7 @@ def choose_camera(
     if abs(log_ratio) >= DOUBTED_SIGMAS * sigma:  # then it is another camera
         estimated = scaled(found.guess.camera, log_ratio)
         return ChosenCamera(estimated, UNKNOWN, IntrinsicsSource.ESTIMATED)
-    spread = np.std([np.log(it.focal_x_px) for it in _cameras_of(view.camera, references)])
+    spread = float(np.std([np.log(it.focal_x_px) for it in _cameras_of(view.camera, references)]))
     return replace(found.guess, camera=scaled(found.guess.camera, log_ratio * spread**2 / (spread**2 + sigma**2)))
 
 
