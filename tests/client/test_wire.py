@@ -99,7 +99,7 @@ def test_an_empty_scene_is_named() -> None:
 
 def test_a_missing_argument_is_reported_by_the_call_s_own_name() -> None:
     with pytest.raises(TypeError, match=r"^localize\(\) missing 1 required positional argument: 'scene'"):
-        Client("localhost").localize(b"x", CAMERA)  # type: ignore[call-arg]
+        Client("localhost").localize(b"x", CAMERA)
 
 
 def test_a_reference_whose_rotation_is_none_is_not_sent() -> None:

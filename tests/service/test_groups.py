@@ -33,6 +33,7 @@ from mapless import (
 from mapless.axes import Axes, pose_to
 from mapless.calls import localization
 from mapless.geometry import rotation_from_vector
+from mapless.messages import sequence_from_message
 
 CORNER = Camera(320, 240, 280.0, 280.0, 160.3, 118.9)
 STANDPOINTS = [corner_pose(-15.0 + 6 * i, height_m=-1.6 + 0.05 * (i % 2)) for i in range(6)]
@@ -130,7 +131,7 @@ def test_soft_priors_of_another_place_do_not_cost_the_answer(corner: Client, que
 @pytest.mark.parametrize("axes", ["", "unity"])
 def test_a_sequence(corner: Client, queries: list[bytes], axes: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the device tracks after it is put into the world, in its own axes and its own unit."""
-    parse = Mock(wraps=localization.sequence_from_message)
+    parse = Mock(wraps=sequence_from_message)
     monkeypatch.setattr(localization, "sequence_from_message", parse)
     name = Axes(axes or "opencv")
     session_from_world = RigidTransform(rotation_from_vector([0.1, -0.3, 0.2]), np.array([3.0, 1.0, -2.0]))

@@ -182,6 +182,6 @@ def test_coverage_is_of_one_unit_though_it_changes_meanwhile(tmp_path: Path) -> 
                 await asyncio.to_thread(client.update_scene, "s", arbitrary_unit=True)
             return found
 
-        server.engine.check_coverage = changing  # type: ignore[method-assign]
+        server.engine.check_coverage = changing  # type: ignore[method-assign, assignment]
         assert client.check_coverage("s", pose(0.0), CAMERA).arbitrary_unit
     assert asked == 2

@@ -4,6 +4,7 @@ import io
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from PIL import ExifTags, Image
@@ -20,7 +21,7 @@ THERE = pose(2.0)
 
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
-    settings = {"features": "sift", "backend": "geometric", "background_matching": False}
+    settings: dict[str, Any] = {"features": "sift", "backend": "geometric", "background_matching": False}
     with serving_really(tmp_path_factory.mktemp("corner"), **settings) as server, Client(server.address) as client:
         make_corner(client, [pose(angle) for angle in (-25, -15, -5, 5, 15, 25)])
         yield client

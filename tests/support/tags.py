@@ -48,11 +48,11 @@ class PrintedTag:
         sheet_seen = cv2.warpPerspective(sheet, homography, size, flags=cv2.INTER_AREA)
         cover = cv2.warpPerspective(np.full_like(sheet, 255), homography, size)
         light, share = (cv2.resize(it, (width, height), interpolation=cv2.INTER_AREA) for it in (sheet_seen, cover))
-        seen = share > 0
-        covered = (share[seen] / 255)[:, None]
-        mixed = LIGHT[image[seen]] * (1 - covered) + covered * (0.02 + 0.6 * (light[seen] / 255)[:, None])
+        on_tag = share > 0
+        covered = (share[on_tag] / 255)[:, None]
+        mixed = LIGHT[image[on_tag]] * (1 - covered) + covered * (0.02 + 0.6 * (light[on_tag] / 255)[:, None])
         painted = image.copy()
-        painted[seen] = np.searchsorted(LIGHT, mixed).clip(0, 255)
+        painted[on_tag] = np.searchsorted(LIGHT, mixed).clip(0, 255)
         return painted
 
 

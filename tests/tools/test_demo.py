@@ -94,7 +94,9 @@ class FakeClient(Client):
     def add_references(self, scene: str, references: Any, **_: Any) -> Any:
         self.stored += [reference.reference_id for reference in references]
 
-    def localize(self, image: Any, camera: Camera, scene: str, *_: Any, **__: Any) -> LocalizationResult | Rejected:
+    def localize(
+        self, image: Any, camera: Camera | None = None, scene: str = "", *_: Any, **__: Any
+    ) -> LocalizationResult | Rejected:
         name, pose = self.truth[image]
         uses = tuple(ReferenceUse(f"scenes/{scene}/references/{n}", 50, 40) for n in self.stored)
         size = (camera.width_px, camera.height_px)
