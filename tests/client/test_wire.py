@@ -98,8 +98,10 @@ def test_an_empty_scene_is_named() -> None:
 
 
 def test_a_missing_argument_is_reported_by_the_call_s_own_name() -> None:
-    with pytest.raises(TypeError, match=r"^localize\(\) missing 1 required positional argument: 'scene'"):
-        Client("localhost").localize(b"x", CAMERA)
+    with pytest.raises(TypeError, match=r"^add_reference\(\) missing 1 required positional argument: 'reference'"):
+        Client("localhost").add_reference("kitchen")  # type: ignore[call-arg]
+    with pytest.raises(ValueError, match="scene must be its id or name"):
+        Client("localhost").localize(b"x")
 
 
 def test_a_reference_whose_rotation_is_none_is_not_sent() -> None:
