@@ -53,7 +53,8 @@ def compare(then: Response, now: Response) -> Comparison:
     first, second = _essence(then), _essence(now)
     if isinstance(then, pb.LocalizeResponse):
         before, after = (getattr(it, it.WhichOneof("outcome") or "rejection") for it in (first, second))
-        if not before.HasField("used_intrinsics"):  # servers before 0.4 do not send it
+        # Servers before 0.4 do not send it.
+        if after.HasField("used_intrinsics") and not before.HasField("used_intrinsics"):
             after.ClearField("used_intrinsics")
     if first.SerializeToString(deterministic=True) == second.SerializeToString(deterministic=True):
         return Comparison(True)
