@@ -67,7 +67,8 @@ def read_parts(database: Path, folder: Path, pictures: Sequence[Picture], featur
     """The models of a folder that have parallax, the one with most photographs first."""
     by_name = {it.name: it for it in pictures}
     models = [pycolmap.Reconstruction(str(it)) for it in sorted(folder.iterdir(), key=lambda it: int(it.name))]
-    moved = [it for it in models if not only_turned(database, it.reg_image_ids())]
+    enough = [it for it in models if it.num_reg_images() >= FEWEST]
+    moved = [it for it in enough if not only_turned(database, it.reg_image_ids())]
     parts = [_part(it, by_name, features) for it in moved if _parallax_deg(it) >= PARALLAX_DEG]
     return tuple(sorted(parts, key=lambda it: -len(it.posed)))
 

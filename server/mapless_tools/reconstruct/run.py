@@ -11,7 +11,7 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pycolmap
@@ -19,9 +19,9 @@ import pycolmap
 from mapless_server.choices import AUTO, BEST_VARIANTS, FEATURES
 from mapless_server.method.features.matching import OPTIONS, fastest_arithmetic
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
-from mapless_server.serve.assembly import make_first_features
+from mapless_server.serve.assembly import ANY_ROLL, make_first_features
 from mapless_server.settings import available_cores, load_settings
-from mapless_tools.progress import Progress
+from mapless_tools.progress import Progress, labelled
 
 from .cameras import LensOptions, StartingCamera, starting_cameras
 from .features import FeatureFolder
@@ -82,20 +82,49 @@ def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, pro
             "or more, each showing half of what the one before shows"
         )
     cameras = starting_cameras(chosen, options.lens)
-    features, database = _compared(chosen, cameras, work, options, progress)
-    models = database.with_name(f"models-{database.name}")
-    with made_once(models) as made:
-        if made is not None:
-            map_photographs(database, made, len(chosen), available_cores(), progress)
-    parts = read_parts(database, models, chosen, features)
+    attempt = _attempt(chosen, cameras, work, options, progress)
+    if options.features == AUTO and attempt.largest < len(chosen):
+        # Learned features match what is upright; some photographs may be rolled against the others.
+        other = _attempt(chosen, cameras, work, replace(options, features=ANY_ROLL), labelled(progress, ANY_ROLL))
+        attempt = max(attempt, other, key=lambda it: it.largest)
+    parts = attempt.parts
     if not parts:
-        raise ValueError(why_no_part(database, models))
+        raise ValueError(why_no_part(attempt.database, attempt.models))
     if options.part > len(parts):
         raise ValueError(f"there is no part {options.part}: the photographs give {len(parts)}")
     part = parts[options.part - 1]
-    left_out = (*pictures.omitted, *omitted(part, parts, chosen, database))
+    left_out = (*pictures.omitted, *omitted(part, parts, chosen, attempt.database))
     placed, world = place(part, options.world, progress)
     return Reconstructed(placed, world, cameras, tuple(len(it.posed) for it in parts), left_out, pictures.notes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Attempt:
+    """What one kind of features gives: the parts, and the files that they are from."""
+
+    database: Path
+    models: Path
+    parts: tuple[Part, ...]
+
+    @property
+    def largest(self) -> int:
+        """Photographs of the largest part."""
+        return max((len(it.posed) for it in self.parts), default=0)
+
+
+def _attempt(
+    pictures: Sequence[Picture],
+    cameras: Sequence[StartingCamera],
+    work: Path,
+    options: ReconstructOptions,
+    progress: Progress,
+) -> _Attempt:
+    features, database = _compared(pictures, cameras, work, options, progress)
+    models = database.with_name(f"models-{database.name}")
+    with made_once(models) as made:
+        if made is not None:
+            map_photographs(database, made, len(pictures), available_cores(), progress)
+    return _Attempt(database, models, read_parts(database, models, pictures, features))
 
 
 def _compared(
