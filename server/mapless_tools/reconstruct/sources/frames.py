@@ -12,7 +12,7 @@ from PIL import Image
 from mapless_tools.progress import Progress
 
 from .jpeg import write_jpeg
-from .video import Video, opened_video, upright_picture
+from .video import Video, opened_video
 from .watching import Watched, packets_of
 
 if TYPE_CHECKING:
@@ -47,13 +47,13 @@ def _pictures(file: Path, watched: Watched, positions: Sequence[int]) -> Iterato
             wanted = {watched.pts[it]: it for it in positions}
             for position, frame in _sought(video, wanted, packets_of(file).key_times):
                 found.add(position)
-                yield position, Image.fromarray(upright_picture(frame, video.pixel_aspect))
+                yield position, Image.fromarray(video.upright(frame))
     rest = {watched.frame[it]: it for it in positions if it not in found}
     if rest and not watched.keys_only:
         with opened_video(file) as video:
             for index, frame in enumerate(video.frames([])):
                 if index in rest:
-                    yield rest[index], Image.fromarray(upright_picture(frame, video.pixel_aspect))
+                    yield rest[index], Image.fromarray(video.upright(frame))
                 if index >= max(rest):
                     return
 

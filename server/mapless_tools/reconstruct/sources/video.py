@@ -29,12 +29,13 @@ _HDR = {16: "PQ", 18: "HLG"}
 """By the number of the transfer function in ITU-T H.273."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Video:
-    """A video that is open, and its stream of pictures."""
+    """A video that is open, and its stream of pictures; `matrix` is its display matrix once a picture was made."""
 
     container: InputContainer
     stream: VideoStream
+    matrix: NDArray[np.float64] | None = None
 
     @property
     def pixel_aspect(self) -> float:
@@ -49,6 +50,12 @@ class Video:
         if self.stream.duration and self.stream.time_base:
             return float(self.stream.duration * self.stream.time_base)
         return (self.container.duration or 0) / 1e6
+
+    def upright(self, frame: VideoFrame) -> NDArray[np.uint8]:
+        """A frame as `upright_picture` has it."""
+        if self.matrix is None:  # once: a frame whose side data are read is part of a circle, and stays in memory
+            self.matrix = display_matrix(frame)
+        return upright_picture(frame, self.pixel_aspect, self.matrix)
 
     def frames(self, errors: list[str]) -> Iterator[VideoFrame]:
         """Yields frames from where the video stands; what is damaged is skipped, and named in `errors`."""
@@ -114,7 +121,7 @@ def small_grey(frame: VideoFrame, size_px: tuple[int, int]) -> NDArray[np.uint8]
     return np.asarray(small.to_ndarray(), np.uint8)
 
 
-def upright_picture(frame: VideoFrame, pixel_aspect: float) -> NDArray[np.uint8]:
+def upright_picture(frame: VideoFrame, pixel_aspect: float, matrix: NDArray[np.float64]) -> NDArray[np.uint8]:
     """A frame (H, W, 3), RGB, as a viewer shows it.
 
     Of interlaced frames every second row is used: the others were taken at another time. Pixels that are not square are
@@ -130,7 +137,7 @@ def upright_picture(frame: VideoFrame, pixel_aspect: float) -> NDArray[np.uint8]
         height = round(height / pixel_aspect)
     if picture.shape[:2] != (height, width):
         picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(_turned(picture, display_matrix(frame)), np.uint8)
+    return np.ascontiguousarray(_turned(picture, matrix), np.uint8)
 
 
 def display_matrix(frame: VideoFrame) -> NDArray[np.float64]:
