@@ -9,6 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 from support.tags import looking, part_of, posed_without_file
 
 from mapless.geodesy import Datum, geodetic_from_world, world_from_geodetic
@@ -227,9 +228,19 @@ def test_rolled_photographs_do_not_move_the_way_down() -> None:
     assert "8 are rolled" in frame.warnings[-1]
 
 
+def down_by_pillow(orientation: int) -> tuple[int, int]:
+    """Where the second row of the upright raster is from its first, in columns and rows of the stored one."""
+    stored = Image.fromarray(np.arange(9, dtype=np.uint8).reshape(3, 3))
+    stored.getexif()[0x0112] = orientation
+    upright = np.asarray(ImageOps.exif_transpose(stored))
+    (row, column), (next_row, next_column) = (divmod(int(upright[i, 0]), 3) for i in (0, 1))
+    return next_column - column, next_row - row
+
+
 @pytest.mark.parametrize("orientation", sorted(DOWN_OF_ORIENTATION))
 def test_the_orientation_of_exif_shows_which_way_is_up(orientation: int) -> None:
-    x, y = DOWN_OF_ORIENTATION[orientation]
+    x, y = down_by_pillow(orientation)
+    assert (x, y) == DOWN_OF_ORIENTATION[orientation]
     roll = np.arctan2(x, y)  # turns the camera so that (x, y) of the raster points down
     turned = [replace(it, rotation=it.rotation @ rotation_from_vector([0, 0, roll])) for it in poses()]
     np.testing.assert_allclose(turned[0].rotation @ [x, y, 0], poses()[0].rotation[:, 1], atol=1e-9)
