@@ -97,6 +97,7 @@ class FakeClient(Client):
     def localize(
         self, image: Any, camera: Camera | None = None, scene: str = "", *_: Any, **__: Any
     ) -> LocalizationResult | Rejected:
+        assert camera is not None
         name, pose = self.truth[image]
         uses = tuple(ReferenceUse(f"scenes/{scene}/references/{n}", 50, 40) for n in self.stored)
         size = (camera.width_px, camera.height_px)
