@@ -20,6 +20,7 @@ TOOLS = {
     "evaluate": ["folder"],
     "replay": ["folder"],
     "replay-bag": ["recording", "scene", "out"],
+    "reconstruct": ["photographs", "out"],
     "view": ["scene"],
     "gateway": [],
     "demo": [],
@@ -66,7 +67,7 @@ def test_a_wrong_flag_ends_serve_with_one_line(flags: list[str], message: str) -
 def test_a_tool_without_its_packages_says_what_to_install(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "missing_package", lambda extra: "absent")
     ended = CliRunner().invoke(commands.app, [name, *TOOLS[name]])
-    extra = name if name in ("view", "gateway") else "tools"
+    extra = name if name in ("view", "gateway", "reconstruct") else "tools"
     assert ended.exit_code == 2
     assert ended.stderr == f"mapless-server: {name} needs the Python package absent: {how_to_install(extra)}\n"
 
@@ -82,7 +83,11 @@ def test_help_imports_nothing_heavy(module: str) -> None:
     assert printed(f"import sys, {module}; print([it for it in {heavy} if it in sys.modules])") == "[]\n"
 
 
-DISTRIBUTION_OF = {"PIL": "pillow", "opentelemetry": "opentelemetry-sdk", "python_multipart": "python-multipart"}
+DISTRIBUTION_OF = {
+    "opentelemetry": "opentelemetry-sdk",
+    "pillow_heif": "pillow-heif",
+    "python_multipart": "python-multipart",
+}
 
 
 def test_every_extra_brings_its_packages() -> None:
