@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera
+from mapless_server import __version__
 from mapless_server.images import ANY_SIZE, decode_image, upright_of
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.extractors.turned import extract_upright
@@ -98,4 +99,4 @@ def _plain_camera(width: int, height: int) -> Camera:
 
 
 def _digest(picture: Picture, extractor: str) -> str:
-    return hashlib.sha256(picture.path.read_bytes() + extractor.encode()).hexdigest()[:32]
+    return hashlib.sha256(picture.path.read_bytes() + f"{extractor} {__version__}".encode()).hexdigest()[:32]

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pycolmap
 
+from mapless_server import __version__
 from mapless_server.choices import AUTO, BEST_VARIANTS, FEATURES
 from mapless_server.method.features.matching import OPTIONS, fastest_arithmetic
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
@@ -142,7 +143,7 @@ def _compared(
     pairs = pairs_of(names, features, VladDescriptor.of(extractor), options.pairs, progress)
     files = [features.file(it.name).stem for it in pictures]
     ratio = OPTIONS[kind].query_ratio
-    key = _digest(files, names, pairs, ratio)
+    key = _digest(__version__, files, names, pairs, ratio)  # another release may write other files
     matches = MatchFolder(work / f"matches-{key}", features, ratio, fastest_arithmetic())
     matches.match(pairs, progress)
     database = work / f"database-{_digest(key, [repr(it) for it in cameras])}"
