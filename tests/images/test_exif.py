@@ -2,6 +2,7 @@
 
 import io
 import math
+import struct
 from typing import Any
 
 import numpy as np
@@ -131,3 +132,14 @@ def test_all_formats_say_which_way_is_up(ending: str) -> None:
     Image.new("RGB", (40, 30)).save(out, ending[1:], exif=exif)
     assert upright_of(out.getvalue()) == Upright(clockwise_deg=270.0)
     assert upright_of(encode(ending, textured(40, 30))) == Upright()
+
+
+@pytest.mark.parametrize("pointer", [ExifTags.Base.ExifOffset, ExifTags.Base.GPSInfo])
+def test_a_pointer_beyond_all_files_is_as_no_exif(pointer: int) -> None:
+    """As LONG8, which Pillow reads in TIFF of any kind, a pointer may be larger than a position in a file."""
+    entry = struct.pack("<HHI", pointer, 16, 1) + struct.pack("<I", 26)
+    tiff = b"II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0) + struct.pack("<Q", 2**63)
+    segment = b"Exif\0\0" + tiff
+    jpeg = encode(".jpg", textured(40, 30))
+    data = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
+    assert read_exif(data) == NO_EXIF

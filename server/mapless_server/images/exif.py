@@ -13,14 +13,27 @@ focal length as it is without zoom.
 import io
 import math
 import struct
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from PIL import ExifTags, Image
 
+# Pillow warns of each damaged tag, of which a file of a stranger may have thousands.
+warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.TiffImagePlugin")
+
 _FORMATS = ("JPEG", "PNG", "WEBP")
-_DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, struct.error, Image.DecompressionBombError)
+_DAMAGED = (
+    ArithmeticError,
+    Image.DecompressionBombError,
+    KeyError,
+    OSError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
 """What Pillow raises for files whose header or EXIF it cannot read."""
 _MAX_TEXT = 200
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
@@ -72,7 +85,7 @@ class Exif:
     @property
     def optics(self) -> tuple[object, ...]:
         """What photographs of one camera, with one lens at one focal length, have in common; empty if nothing says."""
-        if not (self.make and self.model):
+        if not (self.make and self.model and (self.focal_mm or self.film_focal_mm)):
             return ()
         return self.make, self.model, self.lens, self.focal_mm, self.film_focal_mm, self.digital_zoom
 

@@ -100,7 +100,18 @@ def from_colmap(camera: pycolmap.Camera) -> Camera:
 
 
 def starting_cameras(pictures: Sequence[Picture], options: LensOptions) -> tuple[StartingCamera, ...]:
-    """One camera for each make, model, lens, focal length and size, and one for each video."""
+    """One camera for each make, model, lens, focal length and size, and one for each video.
+
+    ValueError if no photograph has the size of a known camera.
+    """
+    sizes = {(it.width_px, it.height_px) for it in pictures}
+    for camera in options.known:
+        if (camera.width_px, camera.height_px) not in sizes:
+            shown = ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
+            raise ValueError(
+                f"--lens: no photograph has {camera.width_px}x{camera.height_px} pixels, as the camera has; they have "
+                f"{shown}"
+            )
     groups: dict[tuple[object, ...], list[Picture]] = {}
     for picture in pictures:
         groups.setdefault(_key(picture), []).append(picture)
@@ -110,7 +121,7 @@ def starting_cameras(pictures: Sequence[Picture], options: LensOptions) -> tuple
 def _key(picture: Picture) -> tuple[object, ...]:
     size, exif = (picture.width_px, picture.height_px), picture.exif
     if picture.time is not None:
-        return (picture.time.video, *size)
+        return (picture.source, *size)
     return exif.make, exif.model, exif.lens, exif.focal_mm, exif.film_focal_mm, exif.digital_zoom, *size
 
 

@@ -191,6 +191,8 @@ def prepare(sources: Sequence[Path], out: Path) -> Path:
     if out.exists() and not out.is_dir():
         raise ValueError(f"{out} is not a folder: the folder to write comes last")
     if out.exists() and not work.is_dir() and any(out.iterdir()):
-        raise ValueError(f"{out} is not empty, and not from an earlier run: name a folder that is not there")
+        raise ValueError(
+            f"{out} is not empty, and has no results to go on from: delete it, or name a folder that is not there"
+        )
     work.mkdir(parents=True, exist_ok=True)
     return work

@@ -11,7 +11,7 @@ from support.images import encode, textured
 from typer.testing import CliRunner
 
 from mapless.cli.output import plain
-from mapless.geometry import Array
+from mapless.geometry import Array, Camera
 from mapless_server.images import ANY_SIZE, decode_image
 from mapless_server.method.features.extractors import SiftExtractor, SiftOptions
 from mapless_server.scenes.retrieval.vlad import VladDescriptor, shipped
@@ -20,9 +20,11 @@ from mapless_tools.demo.photographs import Photograph, room
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.metres import umeyama
 from mapless_tools.progress import Progress
+from mapless_tools.reconstruct.cameras import LensOptions, starting_cameras
 from mapless_tools.reconstruct.features import FeatureFolder
 from mapless_tools.reconstruct.matching import PairOptions, pairs_of
 from mapless_tools.reconstruct.output import write_folder
+from mapless_tools.reconstruct.pictures import Picture, VideoTime
 from mapless_tools.reconstruct.run import (
     Reconstructed,
     ReconstructOptions,
@@ -174,6 +176,22 @@ def test_photographs_of_nothing_common_are_refused(tmp_path: Path, chosen: Seque
     ]
     with pytest.raises(ValueError, match="no two photographs show the same place"):
         reconstructed(photographs(tmp_path / "photos", apart), tmp_path / "out")
+
+
+def test_videos_of_one_name_have_a_camera_each() -> None:
+    frames = [
+        Picture(
+            f"{device}_{i}", Path("x.jpg"), 640, 480, Path(device, "VID.mp4"), time=VideoTime("VID.mp4", i, 0.1 * i)
+        )
+        for device in ("phone", "glasses")
+        for i in range(2)
+    ]
+    assert [it.names for it in starting_cameras(frames, LensOptions())] == [
+        ("phone_0", "phone_1"),
+        ("glasses_0", "glasses_1"),
+    ]
+    with pytest.raises(ValueError, match=r"no photograph has 1280x720 pixels.*they have 640x480"):
+        starting_cameras(frames, LensOptions(known=(Camera.centred(1280, 720, 900.0),)))
 
 
 def test_folder_of_others_is_not_written_to(tmp_path: Path) -> None:

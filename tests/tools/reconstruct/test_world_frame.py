@@ -323,6 +323,15 @@ def test_gps_that_contradicts_a_distance_is_named() -> None:
     assert "GPS contradicts the unit" in "\n".join(frame.warnings)
 
 
+def test_two_positions_that_contradict_give_no_datum() -> None:
+    zurich, bern = GpsPosition(47.3769, 8.5417, 400.0), GpsPosition(46.9480, 7.4474, 540.0)
+    exif = [Exif(position=zurich, direction_deg=10.0), Exif(position=bern), *[Exif()] * 22]
+    metres = float(np.linalg.norm(poses()[0].translation - poses()[12].translation))
+    _, frame = placed(part_with(poses(), exif), distance=[distance("r0", "r12", metres)])
+    assert frame.datum is None
+    assert "GPS of 2 photographs is not used" in "\n".join(frame.warnings)
+
+
 def test_gps_of_a_drone_that_looks_down_gives_up() -> None:
     generator = np.random.default_rng(6)
     down = [

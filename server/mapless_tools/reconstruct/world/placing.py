@@ -192,8 +192,10 @@ def _with_earth(part: Part, known: _Known, said: _Said) -> _Known:
     fit = fit_gps(part, fixes, known.down)
     if fit is None and fixes.are_one_place:
         said.notes.append("GPS gives no unit: its positions are those of one place, to their accuracy")
-    elif fit is None and len(fixes.photographs) >= MIN_FIXES:
-        said.warnings.append(f"GPS of {len(fixes.photographs)} photographs does not agree with their poses: not used")
+    elif fit is None:
+        count = len(fixes.photographs)
+        why = "does not agree with their poses" if count >= MIN_FIXES else f"is too little: {MIN_FIXES} are needed"
+        said.warnings.append(f"GPS of {count} photographs is not used, since it {why}")
         return known
     if fit is not None:
         known = replace(known, scale=_with_gps(part, fit, known.scale, said))

@@ -107,7 +107,10 @@ def _observed(posed: Sequence[PosedPicture], seen: Sequence[Sighting]) -> _Obser
 
 
 def _largest_agreement(seen: _Observed) -> list[int] | None:
-    """Indices of the sightings, one of each photograph, that agree on one place; None if they are too few."""
+    """Indices of the sightings, one of each photograph, that agree on one place; None if they are too few.
+
+    Their rays intersect.
+    """
     pairs = [(i, j) for i, j in combinations(range(len(seen)), 2) if seen.photographs[i] != seen.photographs[j]]
     if len(pairs) > MAX_PAIRS:
         chosen = np.random.default_rng(0).choice(len(pairs), MAX_PAIRS, replace=False)
@@ -120,10 +123,11 @@ def _largest_agreement(seen: _Observed) -> list[int] | None:
         agreeing, cost = _agreeing(seen, corners)
         if (len(agreeing), -cost) > least:
             best, least = agreeing, (len(agreeing), -cost)
-    if len(best) < MIN_PHOTOGRAPHS:
+    start = _intersections(seen[np.array(best)]) if len(best) >= MIN_PHOTOGRAPHS else None
+    if start is None:
         return None
-    refined, _ = _agreeing(seen, _refined(seen[np.array(best)], _start(seen[np.array(best)])))
-    return max(best, refined, key=len)
+    refined, _ = _agreeing(seen, _refined(seen[np.array(best)], start))
+    return refined if len(refined) > len(best) and _intersections(seen[np.array(refined)]) is not None else best
 
 
 def _agreeing(seen: _Observed, corners: Array) -> tuple[list[int], float]:
@@ -151,7 +155,7 @@ def _intersections(seen: _Observed) -> Array | None:
 
 def _start(seen: _Observed) -> Array:
     found = _intersections(seen)
-    assert found is not None, "they contain a pair whose rays intersect"
+    assert found is not None, "sightings that agree have rays that intersect"
     return found
 
 

@@ -94,9 +94,9 @@ def suspects_of(errors: Sequence[PairError]) -> tuple[int, ...]:
     while True:
         total = Counter(i for error in left for i in error.pair)
         bad = Counter(i for error in left if error.is_bad for i in error.pair)
-        doubtful = []
+        doubtful, all_bad = [], sum(error.is_bad for error in left)
         for i in bad:
-            others, their_bad = len(left) - total[i], sum(error.is_bad for error in left) - bad[i]
+            others, their_bad = len(left) - total[i], all_bad - bad[i]
             chance = bdtrc(bad[i] - 1, total[i], (their_bad + 1) / (others + 1 / RIGHT_BAD_SHARE))
             is_chance = chance > 0 and math.log10(len(photographs) * chance) > MAX_LOG10_CHANCE
             if bad[i] >= (1 - WRONG_SHARE) * total[i] and not is_chance:
