@@ -1,4 +1,4 @@
-"""What a photograph's EXIF says of its camera, of the way up and of the place, and the focal length that follows.
+"""A photograph's EXIF: its camera, the way up, the place, and the focal length that follows.
 
 EXIF is written by anyone: each value that is missing or impossible is as none. Its orientation is not applied to the
 raster (see `decode`), and the size that it states is that of the photograph as it was taken: programs that resize or
@@ -34,7 +34,7 @@ _DAMAGED = (
     ValueError,
     struct.error,
 )
-"""What Pillow raises for files whose header or EXIF it cannot read."""
+"""Errors of Pillow for files whose header or EXIF it cannot read."""
 _MAX_TEXT = 200
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _FILM_MM = (5.0, 1000.0)
@@ -64,7 +64,7 @@ class GpsPosition:
 
 @dataclass(frozen=True)
 class Exif:
-    """What EXIF says; texts are empty and numbers 0 where it says nothing.
+    """The values of EXIF; texts are empty and numbers 0 where it says nothing.
 
     `orientation` is 1 to 8: how the stored raster has to be turned to be upright, 1 as it is. `taken_px` is width and
     height of the photograph as it was taken. `direction_deg` is the direction of view, degrees clockwise from north.
@@ -84,7 +84,7 @@ class Exif:
 
     @property
     def optics(self) -> tuple[object, ...]:
-        """What photographs of one camera, with one lens at one focal length, have in common; empty if nothing says."""
+        """The values that photographs of one camera, lens and focal length share; empty if EXIF lacks them."""
         if not (self.make and self.model and (self.focal_mm or self.film_focal_mm)):
             return ()
         return self.make, self.model, self.lens, self.focal_mm, self.film_focal_mm, self.digital_zoom

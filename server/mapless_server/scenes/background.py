@@ -78,7 +78,7 @@ class BackgroundOptions:
 
 @dataclass(frozen=True, eq=False)
 class SceneWork:
-    """What is computed of scenes besides matches; None for what is not.
+    """The work on scenes besides matches; None for work that is not done.
 
     Attributes:
         calibrations: made when all references are matched; they use depths.

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 _POLL_S = 0.05
 _REMEMBERED_EXIFS = 20_000
-"""Of so many references EXIF is kept in memory, half a KB each."""
+"""Number of references whose EXIF is kept in memory, half a KB each."""
 
 Loaded = tuple[SceneState, tuple[PosedView, ...]]
 """A scene and references of it, read at one moment."""

@@ -26,7 +26,7 @@ GUESSED_FOCAL = 1.2
 
 @dataclass(frozen=True)
 class LensOptions:
-    """What is known of the cameras beside EXIF.
+    """The knowledge of the cameras beside EXIF.
 
     Attributes:
         fisheye: all lenses are fisheyes, whose coefficients are estimated.
@@ -39,7 +39,7 @@ class LensOptions:
     def __post_init__(self) -> None:
         sizes = [(it.width_px, it.height_px) for it in self.known]
         if len(set(sizes)) < len(sizes):
-            raise ValueError("known has two cameras of one size: photographs are told apart by their size alone")
+            raise ValueError("known has two cameras of one size: photographs are distinguished by their size alone")
 
     @staticmethod
     def of(texts: Sequence[str]) -> LensOptions:

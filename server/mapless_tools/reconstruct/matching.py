@@ -1,4 +1,4 @@
-"""Which photographs are compared, their matches, and the geometry of each pair, in pycolmap's database."""
+"""The pairs of photographs that are compared, their matches, and the geometry of each pair, in pycolmap's database."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ITERATIONS = 100, 2000
 
 @dataclass(frozen=True)
 class PairOptions:
-    """Which photographs are compared with which.
+    """The choice of pairs of photographs to compare.
 
     Attributes:
         all_below: so many photographs and fewer are all compared with one another.

@@ -1,4 +1,4 @@
-"""What a reconstruction is made of and what it is: photographs without poses, and their cameras and poses."""
+"""The input and the result of a reconstruction: photographs without poses, and their cameras and poses."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -101,7 +101,7 @@ def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, pro
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """What one kind of features gives: the parts, and the files that they are from."""
+    """The result of one kind of features: the parts, and the files that they are from."""
 
     database: Path
     models: Path

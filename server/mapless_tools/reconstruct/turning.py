@@ -22,7 +22,7 @@ PARALLAX_SHARE = 0.25
 _MATCHES, _PAIRS = 100, 150
 _MIN_MATCHES = 15
 _FACTORS, _RADIAL = (0.4, 0.55, 0.75, 1.0, 1.35, 1.8, 2.5), 0.5
-"""Of focal lengths where the search begins, and the largest radial coefficient."""
+"""Focal lengths at which the search begins, and the largest radial coefficient."""
 
 
 def only_turned(database: Path, image_ids: Collection[int]) -> bool:

@@ -133,7 +133,7 @@ def shade(room: Room, camera: Camera, world_from_camera: RigidTransform) -> Floa
 
 
 class Settings(NamedTuple):
-    """What a phone does to the light: blur in pixels, exposure in stops, gains of red and blue, factor of the noise."""
+    """A phone's effects on light: blur in pixels, exposure in stops, gains of red and blue, factor of noise."""
 
     blur_px: float
     stops: float

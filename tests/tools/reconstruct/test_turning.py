@@ -1,4 +1,4 @@
-"""A camera that only turned is told from one that moved, whatever its focal length and lens are taken for."""
+"""A camera that only turned is distinguished from one that moved, whatever its focal length and lens are taken for."""
 
 from itertools import combinations
 from pathlib import Path

@@ -25,7 +25,7 @@ _SHARPEST_PERCENT = 20
 _MIN_EDGES = 200
 _MIN_IN_DIRECTION = 50
 _MIN_SHARE = 0.04
-"""Of the edges, that a direction must have; fewer may all be shadows, which are soft."""
+"""Share of the edges that a direction must have; fewer may all be shadows, which are soft."""
 _MAX_BLUR_PX = 20.0
 
 

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from .tracks import MIN_CORNERS, Reference
 
 _LOST_SHARE = 0.3
-"""Of the corners of a view; that many of them no longer seen make another view. Two views that share 70 % of what they
-show have common points with three or more of their neighbours."""
+"""Share of the corners of a view; that many of them no longer seen make another view. Two views that share 70 % of
+what they show have common points with three or more of their neighbours."""
 _MOTION = 0.08
-"""Of the diagonal; this much median motion makes another view, even if all is still seen, as when walking forward."""
+"""Share of the diagonal; this much median motion makes another view, even if all is still seen, as when walking
+forward."""
 _BLURRED = 0.5
 _RECENT = 15
 _MAX_WAIT = 15

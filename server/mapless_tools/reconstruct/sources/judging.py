@@ -33,7 +33,7 @@ _BLURRED_RATIO = 2.5
 
 
 def without_duplicates(photographs: Sequence[Looked]) -> tuple[list[Looked], list[Omitted]]:
-    """Of files that show the same picture the one with the most pixels is kept, of these that with the most bytes."""
+    """Keeps, of files that show the same picture, the one with the most pixels, of these that with the most bytes."""
     omitted: dict[int, Omitted] = {}
     order = sorted(range(len(photographs)), key=lambda i: _worth(photographs[i]), reverse=True)
     for first, second in _alike([photographs[i] for i in order]):

@@ -16,7 +16,7 @@ from .videos import ChosenFrame, read_videos
 
 _LOG = "sources.jsonl"
 _STEM_CHARACTERS = 100
-"""Of a video's name in that of a frame, which is to have room for the frame's index."""
+"""Characters of a video's name in that of a frame, which is to have room for the frame's index."""
 
 
 def read_sources(sources: Sequence[Path], folder: Path, options: SourceOptions, progress: Progress) -> Pictures:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 _VERSION = 1
-"""Of the computations: results of another version are not used."""
+"""Version of the computations: results of another version are not used."""
 
 
 class Remembered:

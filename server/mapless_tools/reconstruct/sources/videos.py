@@ -77,7 +77,7 @@ def _watched(
     remembered: Remembered,
     progress: Progress,
 ) -> Watched | Omitted:
-    """What a video shows, or why it takes no part."""
+    """The frames that a video offers, or why it takes no part."""
     try:
         copied = next((it for it in earlier if filecmp.cmp(it.path, file.path, shallow=False)), None)
         if copied:

@@ -25,8 +25,8 @@ _TRACKS_PX = 320
 _TRACKS_PER_S = 15.0
 """Frames that are compared; a hand turns a camera by 5 degrees meanwhile, a tenth of what it shows."""
 _MAX_PIXELS = 5e10
-"""Of all frames of a video together: 13 minutes of 1080p at 30 Hz, which take three minutes. Of longer ones, the key
-frames are looked at."""
+"""Pixels of all frames of a video together: 13 minutes of 1080p at 30 Hz, which take three minutes. Of longer ones, the
+key frames are looked at."""
 _KEYS_PER_FRAME = 2
 _BLANK_DEVIATION = 3.0
 """Grey levels: a frame of less contrast, such as of a covered lens, is not chosen."""

@@ -46,7 +46,7 @@ class WorldFlags:
     gps: Annotated[bool, typer.Option("--gps/--no-gps", help="Use GPS in EXIF, where it is precise enough.")] = True
 
     def options(self) -> WorldOptions:
-        """What the flags say; ValueError names the flag and what is wrong with it."""
+        """The options of the flags; ValueError names the flag and what is wrong with it."""
         from mapless_tools.ingest.metres import known_distance
 
         from .options import WorldOptions, parse_sized_tag, parse_tag

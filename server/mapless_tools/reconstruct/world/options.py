@@ -1,4 +1,4 @@
-"""What is known of the unit of length, the origin and the way up of a reconstruction, and the flags that give it."""
+"""The known unit of length, origin and way up of a reconstruction, and the flags that give them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class SizedTag:
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """What is known of the world of a reconstruction; nothing by default but GPS in EXIF, where that suffices.
+    """The knowledge of a reconstruction's world; nothing by default but GPS in EXIF, where that suffices.
 
     `origin` is a tag of `tags`. `positions` is a CSV file of camera centres, metres (name, x, y, z), or a folder of
     photographs with metric poses in a known layout; `positions_up` is the axis that points up in them, "" if none is

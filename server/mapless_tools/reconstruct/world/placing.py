@@ -46,7 +46,7 @@ MAX_TILT_SIGMA_DEG = 3.0
 
 @dataclass
 class _Said:
-    """What is to be said of the world."""
+    """Notes and warnings about the world, in the order of the steps."""
 
     notes: list[str]
     warnings: list[str]
@@ -62,7 +62,7 @@ class _Earth:
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """What the sources give; None where none of them gives it."""
+    """Unit, way down and place as the sources give them; None where none of them gives it."""
 
     tags: FoundTags
     positions: KnownPositions | None
