@@ -34,7 +34,7 @@ _ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one target.
+    """The result of one target.
 
     Attributes:
         target, area: which.

@@ -15,7 +15,7 @@ from mapless_server.rpc import to_status
 from mapless_tools.ingest.formats.collecting import check_camera
 
 _TRAILER_BYTES = 8192
-"""What gRPC gives all of a call's trailers; base64 makes four bytes of three."""
+"""The bytes that gRPC gives all of a call's trailers; base64 makes four bytes of three."""
 
 
 def check_pose(pose: RigidTransform, max_coordinate_m: float = MAX_COORDINATE_M) -> None:

@@ -40,7 +40,7 @@ _IDENTIFIER = re.compile(r"[A-Za-z0-9_.-]{1,64}", re.ASCII)
 
 
 class Aborted(Exception):
-    """What grpc raises in a handler that aborted its call."""
+    """The error that grpc raises in a handler that aborted its call."""
 
 
 class Context:

@@ -9,7 +9,7 @@ _MOST_AT_ONCE = 16
 
 
 def mutator(random: Random, words: Sequence[bytes] = ()) -> MutateBytes:
-    """What changes, inserts, removes or repeats some bytes."""
+    """A mutator that changes, inserts, removes or repeats some bytes."""
 
     def mutate(data: bytes) -> bytes:
         position = random.randrange(len(data) + 1)

@@ -36,7 +36,7 @@ class Watched:
         self._inputs = self._accepted = 0
 
     def __call__(self, data: bytes) -> None:
-        """What libFuzzer calls."""
+        """Called by libFuzzer."""
         before_s, before_bytes = time.process_time(), _peak_bytes()
         accepted = self._check(data)
         spent_s, grown_bytes = time.process_time() - before_s, _peak_bytes() - before_bytes

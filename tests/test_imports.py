@@ -70,7 +70,7 @@ def imports_of(
 
 
 def _at_import(node: ast.AST, typing: bool) -> Iterator[ast.AST]:
-    """What runs when a module is imported, or is read by a type checker: everything outside functions."""
+    """The statements that run on import or that a type checker reads: everything outside functions."""
     for child in ast.iter_child_nodes(node):
         is_for_types = (
             isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING"
@@ -83,13 +83,13 @@ def _at_import(node: ast.AST, typing: bool) -> Iterator[ast.AST]:
 
 @cache
 def all_imports(*, deferred: bool) -> dict[str, set[str]]:
-    """What each module imports; a package's own modules count as imported by those who import the package."""
+    """The imports of each module; a package's own modules count as imported by those that import the package."""
     known = {name: path for package in SOURCES for name, path in modules_of(package).items()}
     return {name: set(imports_of(name, path, known, deferred=deferred)) - {name} for name, path in known.items()}
 
 
 def graph(*packages: str, deferred: bool) -> dict[str, set[str]]:
-    """What the modules of some packages import of one another."""
+    """The imports among the modules of some packages."""
     found = all_imports(deferred=deferred)
     known = {name for name in found if name.partition(".")[0] in packages}
     return {name: found[name] & known for name in known}
@@ -170,7 +170,7 @@ def test_the_list_of_the_method_is_complete_and_in_order() -> None:
 
 
 def packages_of(room: str) -> set[str]:
-    """What the modules of a room import from outside mapless: the first two parts of each name."""
+    """The imports of a room's modules from outside mapless: the first two parts of each name."""
     names: set[str] = set()
     for path in (ROOT / "server" / "mapless_server" / room).rglob("*.py"):
         for node in ast.walk(parsed(path)):
@@ -194,7 +194,7 @@ def test_the_queue_needs_nothing_but_the_standard_library() -> None:
 
 
 def test_services_load_little_of_what_computes() -> None:
-    """What a reader of the services has to know at most: all that loading them loads."""
+    """All that loading the services loads: the most that their reader has to know."""
     known = {name: path for package in SOURCES for name, path in modules_of(package).items()}
     loaded, waiting = set[str](), [name for name in known if name.startswith("mapless_server.services")]
     while waiting:

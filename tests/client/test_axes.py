@@ -28,7 +28,7 @@ FORWARD = {
     Axes.UNITY: (0, 0, 1),
     Axes.ROS: (1, 0, 0),
 }
-"""What each system's documents say of a camera's axes."""
+"""Camera axes by each system's documents."""
 
 
 def pose(right: Array | tuple[float, ...], down: tuple[float, ...], forward: tuple[float, ...]) -> RigidTransform:
@@ -129,7 +129,7 @@ def test_a_session_leads_to_the_same_in_all_axes(
 
 @given(all_axes, rigid, vector)
 def test_a_small_turn_is_the_same_turn_in_all_axes(axes: Axes, world_from_camera: RigidTransform, w: Array) -> None:
-    """What `covariance_to` does to rotation vectors, against turning a pose and converting it."""
+    """`covariance_to` for rotation vectors, against turning a pose and converting it."""
     turn = 1e-3 * np.append(np.zeros(3), w)
     turned = RigidTransform(rotation_from_vector(turn[3:]) @ world_from_camera.rotation, world_from_camera.translation)
     in_axes = module.pose_to(axes, turned).rotation @ module.pose_to(axes, world_from_camera).rotation.T

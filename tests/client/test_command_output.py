@@ -1,4 +1,4 @@
-"""What a person reads on the terminal, and the small change of the command's arguments."""
+"""The terminal's text for people, and small cases of the command's arguments."""
 
 import json
 import re

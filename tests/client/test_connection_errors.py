@@ -116,7 +116,7 @@ def has_two_addresses(monkeypatch: pytest.MonkeyPatch, host: str, port: int) -> 
 
 
 def test_a_hidden_reason_is_found(addresses: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two addresses of a name, the one that is reported is the one where nothing listens."""
+    """The address reported, of a name's two, is the one where nothing listens."""
     host, port = addresses["tls"].split(":")
     has_two_addresses(monkeypatch, host, int(port))
     reported = MaplessError("UNAVAILABLE", f"cannot connect to [::1]:{port}: {REFUSED} (connection refused)")

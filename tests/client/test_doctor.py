@@ -55,7 +55,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory, files: Path) -> Iterator[R
 
 
 def findings(capsys: pytest.CaptureFixture[str], address: str, *flags: object, code: int = 1) -> dict[str, Any]:
-    """What is found, by check; the command ends with a code and prints no error."""
+    """The findings, by check; the command ends with a code and prints no error."""
     ended, printed, error = run_client(capsys, "doctor", "--address", address, "--json", *flags)
     assert (ended, error) == (code, "")
     found = {it["check"]: it for it in json.loads(printed)}
@@ -118,7 +118,7 @@ def test_tls_on_one_side_only(
 
 
 def test_an_expired_certificate(capsys: pytest.CaptureFixture[str], files: Path) -> None:
-    """Of another program than ours, which does not start with it."""
+    """The server is another program than ours, which does not start with its certificate."""
     expired = signed(OURS, "server", -2 * DAY, -DAY)
     server = grpc.server(ThreadPoolExecutor(1))
     credentials = grpc.ssl_server_credentials([(expired.key_pem, expired.certificate_pem)])

@@ -35,7 +35,7 @@ ANSWER = pb.LocalizeResponse(
 )
 REJECTION = pb.LocalizeResponse(rejection=pb.Rejection(reason=pb.REJECTION_REASON_LOW_OVERLAP))
 Fault = Callable[[str, grpc.ServicerContext], "pb.LocalizeResponse | None"]
-"""What becomes of a photograph by its name, None for a pose."""
+"""The outcome of a photograph by its name, None for a pose."""
 
 
 @dataclass
@@ -112,7 +112,7 @@ def run(
 def test_refused_photographs_do_not_wait_behind_new_ones(
     server: FewAtATime, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of four at a time one is taken, and answered when each of the others was refused and has come again."""
+    """One of four at a time is taken, and answered when each of the others was refused and has come again."""
     server.room, server.first = 1, 4  # a refusal before would make the client send fewer at a time
 
     def until_all_came_again(name: str, context: grpc.ServicerContext) -> None:

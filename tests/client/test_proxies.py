@@ -1,4 +1,4 @@
-"""Which addresses a proxy of the environment is used for, and how an error names it."""
+"""The addresses a proxy of the environment is used for, and how an error names it."""
 
 import pytest
 

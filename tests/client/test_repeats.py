@@ -33,7 +33,7 @@ CAMERA = Camera(640, 480, 500, 500, 320, 240)
 
 
 def created(there: Any, generation: int = 1) -> Any:
-    """What `create_scene` with DATUM and DOWN makes of it if this scene is there after a lost answer."""
+    """The result of `create_scene` with DATUM and DOWN if this scene is there after a lost answer."""
     there = pb.GetSceneResponse(
         scene=pb.Scene(name="scenes/hall", generation=generation, datum=there.datum, down_in_world=there.down_in_world)
         if isinstance(there, pb.CreateSceneRequest)

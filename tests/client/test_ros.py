@@ -53,7 +53,7 @@ BAYER = {"bayer_rggb": "RGGB", "bayer_bggr": "BGGR", "bayer_gbrg": "GBRG", "baye
 
 
 def mosaic(pattern: str) -> np.ndarray:
-    """What a sensor with these filters, its first two rows named from the left, sees of SMOOTH."""
+    """SMOOTH as a sensor with these filters sees it, its first two rows named from the left."""
     seen = np.zeros(SMOOTH.shape[:2], np.uint8)
     for place, colour in enumerate(pattern):
         rows, columns = slice(place // 2, None, 2), slice(place % 2, None, 2)
@@ -177,7 +177,7 @@ def test_equidistant_is_opencvs_fisheye() -> None:
 
 
 def test_rational_images_become_those_of_their_pinhole() -> None:
-    """What the undistorted image shows at a pixel is what the lens showed where OpenCV projects the point."""
+    """A pixel of the undistorted image equals the lens's where OpenCV projects the point."""
     d = np.array([0.45, -0.21, 0.0006, -0.0003, 0.02, 0.78, -0.33, 0.03])
     lens = Camera(640, 480, 500.0, 501.0, 320.5, 239.0)
     ros = camera_from_info(info(lens, d=d, distortion_model="rational_polynomial"))

@@ -1,4 +1,4 @@
-"""What callers rely on: every RPC answers, generated code is that of the protos, and imports go one way."""
+"""The contract with callers: every RPC answers, generated code is that of the protos, and imports go one way."""
 
 import filecmp
 import importlib.metadata

@@ -35,7 +35,7 @@ PROMETHEUS = yaml.safe_load((DEPLOY / "prometheus/prometheus.yaml").read_text())
 SERVICES = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
 PANELS = [panel for panel in DASHBOARD["panels"] if panel["type"] != "row"]
 TARGET_LABELS = {"job": "mapless", "instance": "a:9464", "namespace": "mapless", "pod": "mapless-0"}
-"""What Prometheus adds to every series."""
+"""The labels that Prometheus adds to every series."""
 
 Labels = dict[str, str]
 
@@ -66,7 +66,7 @@ def everything_happened() -> Metrics:
 
 
 def series() -> dict[str, list[Labels]]:
-    """What Prometheus has of a server to which everything happened once: labels by name."""
+    """The series of a server to which everything happened once: labels by name."""
     found: dict[str, list[Labels]] = {"up": [TARGET_LABELS]} | {name: [{}] for name in RECORDED}
     for family in everything_happened().registry.collect():
         for sample in family.samples:

@@ -1,4 +1,4 @@
-"""What the pages say is so: links, commands, Python, tables, settings, metrics and figures."""
+"""The pages are true: links, commands, Python, tables, settings, metrics and figures."""
 
 import ast
 import asyncio
@@ -195,7 +195,7 @@ def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 
 
 def rows(page: Path, heading: str) -> list[list[str]]:
-    """What stands in backticks in the first two columns of the table with this first heading."""
+    """The text in backticks in the first two columns of the table with this first heading."""
     (table,) = re.findall(rf"^\| {heading} \|.*\n\|.*\n((?:\|.*\n)+)", written(page), re.MULTILINE)
     return [re.findall(r"`([\w*/]+)`", "|".join(row.split("|")[1:3])) for row in table.splitlines()]
 

@@ -41,7 +41,7 @@ def lines() -> list[tuple[dict[str, str], list[str]]]:
 
 
 def as_protobuf_json(body: str) -> str:
-    """What grpcurl reads, as protobuf defines JSON: a field mask is a string, which grpcurl takes as a message."""
+    """JSON as grpcurl reads it, but for field masks: a string in protobuf's JSON, a message for grpcurl."""
 
     def with_masks(message: dict[str, Any]) -> dict[str, Any]:
         for name in {"update_mask", "updateMask"} & {*message}:
@@ -98,7 +98,7 @@ def test_every_symbol_is_described(described: Described) -> None:
 
 
 def test_the_request_that_the_shell_puts_together_is_answered(described: Described) -> None:
-    """What `printf`, `cat` and `base64` write for grpcurl's standard input is a request, and it localizes."""
+    """The output of `printf`, `cat` and `base64` for grpcurl's standard input is a request, and it localizes."""
     written = re.findall(r"printf '([^']*)'", SHOWN)
     prefix, suffix = written[:2]
     assert {*written} == {prefix, suffix}  # wherever it is shown

@@ -38,7 +38,7 @@ KEYWORDS = {
     *("type", "typedef", "typeof", "union", "unsigned", "using", "val", "var", "virtual", "void", "volatile", "when"),
     *("import", "where", "while", "with", "yield", "near", "far", "small", "unix", "linux", "major", "minor"),
 }
-"""Of the languages, and macros that system headers define."""
+"""Keywords of the languages, and macros that system headers define."""
 
 ACCESSORS = ("{}_count", "{}_list", "{}_size", "{}_case", "{}_value", "{}_bytes", "{}_builder", "has_{}", "clear_{}")
 """Generated beside a field; a second field of that name would collide."""
@@ -70,7 +70,7 @@ def test_every_proto_names_its_place_in_each_language() -> None:
 
 
 def breaking(module: Path) -> str:
-    """What buf says of a contract, compared with the released one; empty if it breaks nothing."""
+    """Findings of buf on a contract compared with the released one; empty if it breaks nothing."""
     buf = Path(sys.executable).parent / "buf"
     done = subprocess.run(
         [buf, "breaking", module, "--against", PROTO / "released.binpb.gz"], capture_output=True, text=True, timeout=60

@@ -28,7 +28,7 @@ def environment() -> dict[str, str]:
 
 
 def run(*command: str | Path, code: int = 0) -> str:
-    """What a command prints, on both streams."""
+    """A command's output, both streams."""
     done = subprocess.run(
         list(map(str, command)), capture_output=True, text=True, env=environment(), timeout=BUILD_LIMIT_S, cwd="/"
     )
@@ -84,7 +84,7 @@ def test_the_wheel_holds_exactly_the_files_of_the_packages(source: Path, wheel: 
 
 
 def command(programs: Path, extra: str, wheel: Path) -> str:
-    """What installs an extra into an environment of uv's, which has no pip."""
+    """The command that installs an extra into an environment of uv's, which has no pip."""
     return f"uv pip install --python {programs / 'python'} 'mapless[{extra}] @ {wheel.as_uri()}'"
 
 

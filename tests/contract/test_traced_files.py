@@ -20,7 +20,7 @@ MOST_FILES = 42
 BESIDE = ("background", "agreement")
 """Threads that compute for no call."""
 CALLS = 2
-"""What the clock starts may run beside one of them, hardly beside both."""
+"""Work that the clock starts may run beside one of them, hardly beside both."""
 
 
 class Tracer:

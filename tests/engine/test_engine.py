@@ -1,4 +1,4 @@
-"""What a query costs and what it is answered: one tier where that is enough, the better of two where it is not."""
+"""Cost and answer of a query: one tier where that is enough, the better of two where it is not."""
 
 import asyncio
 import gc

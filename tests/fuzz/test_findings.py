@@ -59,7 +59,7 @@ def test_compressed_texts_of_a_png_are_not_inflated() -> None:
 
 
 def test_a_png_with_more_data_than_pixels_is_refused() -> None:
-    """What is left over would be inflated all the same: 3 s for each megabyte."""
+    """The rest would be inflated all the same: 3 s for each megabyte."""
     pixels = zlib.compress(np.random.default_rng(0).bytes(100_000))
     data = PNG[:HEADER_BYTES] + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
     with pytest.raises(InvalidArgument, match="more data than pixels") as caught:

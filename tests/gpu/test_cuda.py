@@ -66,7 +66,7 @@ def test_scores_are_the_cpus() -> None:
 
 
 def test_a_network_running_beside_it_changes_nothing() -> None:
-    """Which kernels one of them may take must not decide what the other one may."""
+    """The kernels that one of them may take must not decide those of the other."""
     expected = match("cuda", torch.float16)
     runner = NetworkRunner(small_network("pi3"), "pi3", "sha", "cuda")
     images = torch.rand(4, 3, 56, 70)

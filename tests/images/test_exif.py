@@ -15,7 +15,7 @@ from mapless_server.images.exif import NO_EXIF, ExifFocal, GpsPosition, Upright,
 
 DIAGONAL_MM = math.hypot(36, 24)
 WHOLE = 28 / DIAGONAL_MM * 500
-"""Of 28 mm, for a frame with a diagonal of 500 pixels: 400x300."""
+"""The focal length of 28 mm for a frame with a diagonal of 500 pixels: 400x300."""
 
 
 def found(size: tuple[int, int], maker: str = "", **tags: Any) -> ExifFocal | None:

@@ -40,7 +40,7 @@ def reference_cache(hits: int) -> LruCache[str]:
 
 
 def samples_of(metrics: Metrics) -> Samples:
-    """What a scrape says, by name and labels, before it is text, which takes long to read."""
+    """The samples of a scrape by name and labels, before they are text, which takes long to read."""
     samples = (sample for family in metrics.registry.collect() for sample in family.samples)
     return {(it.name, frozenset(it.labels.items())): it.value for it in samples}
 

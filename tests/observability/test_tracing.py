@@ -30,7 +30,7 @@ TRACEPARENT = ("traceparent", f"00-{TRACE_ID}-{PARENT_ID}-01")
 
 
 def spans_of(*calls: tuple[Any, ...]) -> dict[str, ReadableSpan]:
-    """What is exported of calls (metadata, code, stages, attributes), by name."""
+    """The exported spans of calls (metadata, code, stages, attributes), by name."""
     exporter = InMemorySpanExporter()
     tracer = OtlpTracer(exporter)
     for metadata, code, stages, attributes in calls:

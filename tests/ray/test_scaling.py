@@ -132,7 +132,7 @@ class Fleet:
         return targets
 
     def _compute(self, load: float) -> tuple[float, float]:
-        """What waits at a replica, and how busy it is; replicas share evenly."""
+        """The queue of a replica, and how busy it is; replicas share evenly."""
         done = min(self.queue_s + load, self.running)
         left = self.queue_s + load - done
         self.queue_s = min(left, self.admitted_s * self.running)

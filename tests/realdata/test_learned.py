@@ -81,7 +81,7 @@ def posed(dataset: Dataset, index: int, tier: Tier) -> PosedView:
 
 
 def answers(dataset: Dataset, tier: Tier) -> list[Answer]:
-    """What one tier says of each query, given all references."""
+    """One tier's answer to each query, given all references."""
     references = [posed(dataset, i, tier) for i in REFERENCES]
     return [localize(view(dataset, i, tier), references, tier.pipeline, LocalizeOptions()) for i in QUERIES]
 

@@ -1,4 +1,4 @@
-"""What poses predict at the same pixels is kept: on a drive, where nothing is fixed to the camera."""
+"""Keypoints that poses predict at the same pixels are kept: a drive, where nothing is fixed to the camera."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""What is counted and traced of calls."""
+"""Metrics and traces of calls."""
 
 from __future__ import annotations
 

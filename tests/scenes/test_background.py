@@ -45,7 +45,7 @@ TWO = (Matching.STRICT, Matching.WIDE)
 
 @dataclass
 class Counts(BackgroundObserver):
-    """What an observer was notified of."""
+    """The notifications of an observer."""
 
     found: Counter[str] = field(default_factory=Counter)
     made: int = 0
@@ -74,7 +74,7 @@ def new(i: int, planted: SyntheticScene = PLANTED) -> NewReference:
 
 
 class Server:
-    """What one server has of matching, without its queue."""
+    """One server's part of matching, without its queue."""
 
     def __init__(
         self,

@@ -107,7 +107,7 @@ class TestFit:
 
 @dataclass
 class Counts(BackgroundObserver):
-    """What an observer was notified of."""
+    """The notifications of an observer."""
 
     calibrated: int = 0
     failures: int = 0
@@ -123,7 +123,7 @@ class Counts(BackgroundObserver):
 
 
 class Server:
-    """What one server has of calibrating, without its queue."""
+    """One server's part of calibrating, without its queue."""
 
     def __init__(self, store: Store, max_cpu_s: float = MAX_CPU_S) -> None:
         self.store, self.counts = store, Counts()

@@ -261,7 +261,7 @@ def checked(
     unit: float = 2.0,
     **limits: float,
 ) -> list[KeptDepth | None]:
-    """What is kept of the true depths, changed, in a unit of its own, with other limits."""
+    """The kept depths: the true ones, changed, in a unit of their own, with other limits."""
     views = tuple(predicted(i, change(i, wall_depth(i)) / unit) for i in range(len(WALL.references)))
     nothing = ReconstructedView(views[0].camera, views[0].point_map, views[0].confidence, IDENTITY)
     scale = MetricScale(unit, ScaleStage.TRIANGULATION, 0.0, 0, Similarity(unit, np.eye(3), np.zeros(3)), found)

@@ -280,7 +280,7 @@ class TestTime:
         assert toy.ends[0] == [(Ending.DEGRADED, "coarse")]
 
     def test_a_prediction_that_is_wrong_does_not_stay_so(self) -> None:
-        """What is not computed teaches nothing: so, now and then, what seems useless is computed all the same."""
+        """Now and then a job that seems useless is computed: one that never runs teaches nothing."""
         toy = Toy()
         for _ in range(20):
             toy.learn("refine", "toy", 30.0)

@@ -65,7 +65,7 @@ def test_a_further_step_is_charged_to_its_caller_too() -> None:
 
 
 def test_a_step_beyond_the_bounds_takes_no_room() -> None:
-    """What waits for an idle thread lets as much be admitted as without it, and does not ask for more servers."""
+    """Jobs that wait for an idle thread neither reduce admission nor ask for more servers."""
     toy, without = Toy(), Toy()
     again(toy, "toy", 6)
     without.admit(stage="refine", client="mine")

@@ -71,7 +71,7 @@ class HealthClient(Client):
 
 
 def health_of(client: HealthClient) -> tuple[bool, ...]:
-    """Of the server, of LocalizationService, and of ReferenceService."""
+    """Health of the server, of LocalizationService, and of ReferenceService."""
     with grpc.insecure_channel(client.address) as channel:
         check = health_pb2_grpc.HealthStub(channel).Check
         answers = [check(health_pb2.HealthCheckRequest(service=name), timeout=30) for name in ("", *SERVICE_NAMES)]

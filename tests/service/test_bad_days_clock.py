@@ -50,7 +50,7 @@ class Clock:
 
     @property
     def environment(self) -> dict[str, Any]:
-        """Of a process that has this clock."""
+        """A process with this clock."""
         return {"LD_PRELOAD": str(self._library), "WALL_CLOCK_FILE": str(self._file)}
 
 

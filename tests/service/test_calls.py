@@ -1,4 +1,4 @@
-"""What every call has: a limit, a deadline, a request id, and errors with what the caller may know and no log."""
+"""Every call has a limit, a deadline, a request id, and errors with what the caller may know and no log."""
 
 import logging
 from collections.abc import Iterator

@@ -57,7 +57,7 @@ def fill(client: Client) -> None:
 
 @pytest.fixture(scope="module")
 def url() -> str:
-    """Of a database with the scenes."""
+    """The URL of a database with the scenes."""
     return shared_cluster().fresh_url()
 
 
@@ -70,7 +70,7 @@ class Fleet:
     client: Client
 
     def who(self, scene: str) -> int:
-        """Which server answers."""
+        """The server that answers."""
         answer = self.client.localize(PHOTO, CAMERA, scene)
         assert isinstance(answer, LocalizationResult)
         return answer.inlier_count - 100
@@ -260,7 +260,7 @@ class Page:
             return response.status, {name.lower(): it for name, it in response.getheaders()}, response.read()
 
     def may_call(self) -> bool:
-        """What the answer to the browser's preflight says."""
+        """The headers of the answer to the browser's preflight."""
         wanted = {
             "access-control-request-method": "POST",
             "access-control-request-headers": "x-grpc-web,x-mapless-scene",
@@ -434,7 +434,7 @@ def test_a_server_that_is_killed_costs_retries_and_no_call(url: str, fleet: Flee
 
 
 def before_the_end(running: Gateway) -> list[str]:
-    """What the deployed pod does before it ends, but for the time that it then waits."""
+    """The deployed pod's steps before it ends, but for the time that it then waits."""
     documents = yaml.safe_load_all((ENVOY / "gateway.yaml").read_text())
     (pod,) = [it["spec"]["template"]["spec"] for it in documents if it["kind"] == "Deployment"]
     *shell, script = pod["containers"][0]["lifecycle"]["preStop"]["exec"]["command"]

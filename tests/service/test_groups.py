@@ -130,7 +130,7 @@ def test_soft_priors_of_another_place_do_not_cost_the_answer(corner: Client, que
 
 @pytest.mark.parametrize("axes", ["", "unity"])
 def test_a_sequence(corner: Client, queries: list[bytes], axes: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the device tracks after it is put into the world, in its own axes and its own unit."""
+    """The device's tracked poses, in its own axes and its own unit."""
     parse = Mock(wraps=sequence_from_message)
     monkeypatch.setattr(localization, "sequence_from_message", parse)
     name = Axes(axes or "opencv")

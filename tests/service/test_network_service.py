@@ -39,7 +39,7 @@ DISTANCE_M = 3.0
 by_one = pytest.mark.parametrize(
     "name", [it if it == "pi3x" else pytest.param(it, marks=pytest.mark.nightly) for it in NETWORKS]
 )
-"""What no network decides, each of which has tests of its own; nightly with the others."""
+"""Tests that no network decides, each of which has tests of its own; nightly with the others."""
 WALL = textured(800, 240, seed=8)
 """Wallpaper: it moves by 100 px when the camera moves by a metre along it."""
 NAMES = ["r0", "r1", "r2", "r3"]

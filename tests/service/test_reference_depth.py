@@ -105,7 +105,7 @@ MAKING: dict[str, Any] = {"reference_depth": "stored", "background_matching": Tr
 
 
 def answers(server: RunningServer, count: int = 2) -> list[LocalizationResult]:
-    """Of the first photographs, without what a scene's calibration changes."""
+    """Answers to the first photographs, without what a scene's calibration changes."""
     found = []
     with Client(server.address) as client:
         for query in room().queries[:count]:

@@ -72,7 +72,7 @@ CAPTURED = 18 + 4
 
 
 def known_of(pose: Pose) -> Priors:
-    """What is true, and neither exact nor certain."""
+    """A true pose, neither exact nor certain."""
     down = pose.rotation.T @ [0.02, 1.0, 0.01]
     return Priors(
         position=PositionPrior(pose.translation + 0.3, radius_m=5.0, covariance_m2=np.eye(3)),

@@ -99,7 +99,7 @@ def test_no_call_fails_while_the_only_server_is_away(tmp_path: Path, how: signal
 
 
 def test_calls_use_the_server_that_is_there(tmp_path: Path) -> None:
-    """Of two that restart one after the other; a call takes hardly longer than otherwise."""
+    """Two servers restart one after the other; a call takes hardly longer than otherwise."""
     folders = [tmp_path / name for name in ("a", "b")]
     ports = [free_port(), free_port()]
     for folder in folders:

@@ -1,4 +1,4 @@
-"""What callers send is stored nowhere, unless the operator asks for it: in no file, no database and no log.
+"""Photographs and requests of callers are stored nowhere, unless the operator asks for it: no file, database or log.
 
 Photographs with planted contents go through every method that takes one, answered and refused, to a server in its own
 process, which has a home, a folder for temporary files and a working folder of its own. Then whatever it could write is
@@ -80,7 +80,7 @@ class Search:
     def __init__(
         self, photos: Sequence[bytes], pixels: Sequence[bytes], features: Sequence[bytes], public: bytes
     ) -> None:
-        """What stands in `public` too, as the tables of a format do, is no secret."""
+        """Text that stands in `public` too, as the tables of a format do, is no secret."""
         self._photos = photos
         # Wherever so many bytes in a row are, the half of them is that begins at a multiple of that.
         known = {public[i : i + 8] for i in range(len(public) - 7)}
@@ -217,7 +217,7 @@ def ask_everything(address: str) -> None:
 
 
 def open_files(process_id: int) -> list[bytes]:
-    """What a process has open, files that were deleted among it."""
+    """The open files of a process, deleted ones among them."""
     found = []
     for entry in Path(f"/proc/{process_id}/fd").iterdir():
         with suppress(OSError):
@@ -227,7 +227,7 @@ def open_files(process_id: int) -> list[bytes]:
 
 
 def test_every_method_that_takes_a_photograph_is_asked() -> None:
-    """Of the service that answers queries; the other one stores references, which is what they are sent for."""
+    """Those of the service that answers queries; the other one stores references, which is their purpose."""
     methods = localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"].methods
     taking = {method.name for method in methods if _takes_an_image(method.input_type)}
     source = inspect.getsource(ask_everything)

@@ -171,7 +171,7 @@ class WriterFactory:
 
 
 class Ledger:
-    """What must be stored, what may be stored, and what was checked already."""
+    """The changes that must be stored, those that may be, and those that were checked already."""
 
     def __init__(self) -> None:
         self.stored: set[str] = set()

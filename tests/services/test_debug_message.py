@@ -39,7 +39,7 @@ def sent(view: View, camera: Camera) -> View:
 def support_of(
     scene: SyntheticScene, camera: Camera, world_from_query: RigidTransform | None, wrong_count: int = 0
 ) -> Support:
-    """What the true matches say, but for some that are mixed up, from photographs of this camera."""
+    """The true matches of photographs of this camera, some of them mixed up."""
     structure, matches = true_structure(scene)
     mixed_up = np.concatenate([np.roll(matches.keypoint[:wrong_count], 1), matches.keypoint[wrong_count:]])
     matches = replace(matches, keypoint=mixed_up)

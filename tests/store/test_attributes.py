@@ -1,4 +1,4 @@
-"""What is known of a scene as a whole is kept exactly, changed one by one, forgotten with it; on either database."""
+"""Attributes of a scene are kept exactly, changed one by one, forgotten with it; on either database."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

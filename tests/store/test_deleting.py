@@ -144,7 +144,7 @@ def leave_some(place: Place, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def leave_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is left when a store is opened."""
+    """The rows left when a store is opened."""
     monkeypatch.setattr(PendingDeletions, "resume", lambda _: None)
 
 
@@ -353,7 +353,7 @@ class TestFullDisk:
 
 
 class TestMemory:
-    """Of scenes that are deleted nothing is held; of others all."""
+    """Nothing is held of deleted scenes, all of others."""
 
     def used_bytes(self, store: Store) -> tuple[int, ...]:
         return tuple(it.used for it in (store.reference_cache, store._resolved, store._scenes))

@@ -1,4 +1,4 @@
-"""What is particular to SQLite: which library, how connections are set, whose a data folder is, faults of its disk."""
+"""Particular to SQLite: which library, how connections are set, whose a data folder is, faults of its disk."""
 
 import logging
 import os

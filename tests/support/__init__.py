@@ -1,1 +1,1 @@
-"""What the tests of several rooms share: servers, stores, planted scenes, damaged files."""
+"""Shared by the tests of several rooms: servers, stores, planted scenes, damaged files."""

@@ -57,18 +57,18 @@ class Page:
                 return result
 
     def evaluate(self, script: str) -> Any:
-        """What a script gives."""
+        """A script's value."""
         result = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
 
     @property
     def text(self) -> str:
-        """What there is to read."""
+        """The visible text."""
         return str(self.evaluate("document.body ? document.body.innerText : ''"))
 
     def screenshot(self) -> NDArray[np.uint8]:
-        """What there is to see, (H, W, 3) RGB."""
+        """The page as a picture, (H, W, 3) RGB."""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None

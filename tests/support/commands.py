@@ -8,12 +8,12 @@ from mapless_tools.cli.app import app
 
 
 def run(*arguments: object) -> Result:
-    """What it printed, and its exit code."""
+    """The command's output, and its exit code."""
     return CliRunner().invoke(app, [*map(str, arguments)])
 
 
 def refusal(*arguments: object) -> str:
-    """What is said of arguments that are wrong: one line beside what is in progress, exit code 2, and no result."""
+    """The message for wrong arguments: one line beside what is in progress, exit code 2, and no result."""
     done = run(*arguments)
     assert done.exit_code == 2, done.output
     assert done.stdout == ""

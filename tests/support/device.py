@@ -1,4 +1,4 @@
-"""What can be seen of work on a device."""
+"""Visible signs of work on a device."""
 
 from collections import Counter
 from typing import Any

@@ -16,7 +16,7 @@ from support.scenes import SyntheticScene, random_for
 
 @dataclass(frozen=True)
 class FakeNetworkOptions:
-    """What the network gets wrong; metres are those of the true world.
+    """The network's errors; metres are those of the true world.
 
     Attributes:
         depth_noise_m: standard deviation of predicted depths.

@@ -61,7 +61,7 @@ def form(**parts: bytes | str) -> tuple[bytes, dict[str, str]]:
 
 
 class Asked:
-    """What a gateway answers."""
+    """A gateway's answer."""
 
     def __init__(self, app: Any) -> None:
         self.app = app

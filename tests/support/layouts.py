@@ -22,7 +22,7 @@ CAMERA = Camera(96, 64, 80.0, 81.0, 47.25, 30.75)
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What a layout is built from, and what must come back."""
+    """The content that a layout is built from, and that must come back."""
 
     poses: tuple[RigidTransform, ...]
     camera: Camera = CAMERA

@@ -112,4 +112,4 @@ def blinded(reconstruction: Reconstruction) -> Reconstruction:
 
 
 class Cancelled(Exception):
-    """What a check raises."""
+    """The error that a check raises."""

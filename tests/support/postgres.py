@@ -131,7 +131,7 @@ class Cluster:
         subprocess.run(command, check=True, capture_output=True, cwd=self._folder, timeout=60)
 
     def _as_user(self) -> list[str]:
-        """What starts a program that ends with its parent, even by SIGKILL, and is not root's.
+        """The prefix of a command that ends with its parent, even by SIGKILL, and is not root's.
 
         A program does it, not Popen's `user` and `preexec_fn`: with these Python forks, and gRPC's handlers of a fork
         sometimes abort the child before it becomes the program.

@@ -51,7 +51,7 @@ class Program:
 
     @property
     def log(self) -> str:
-        """What it has logged so far."""
+        """The log so far."""
         return (self.folder / "log").read_text()
 
     @property
@@ -63,7 +63,7 @@ class Program:
 
     @property
     def output(self) -> str:
-        """What else it prints until it ends."""
+        """The rest of its output until it ends."""
         assert self.process.stdout is not None
         return self.process.stdout.read()
 
@@ -117,7 +117,7 @@ def program(
 
 
 def printed(program: str, *arguments: object) -> str:
-    """What a Python program prints that comes to its end without an error."""
+    """The output of a Python program that ends without an error."""
     command = [sys.executable, "-c", program, *map(str, arguments)]
     return subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=LIMIT_S, check=True).stdout
 

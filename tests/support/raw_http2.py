@@ -13,7 +13,7 @@ _INITIAL_WINDOW_SIZE = 0x4
 
 
 def hello(window_bytes: int = 65_535) -> bytes:
-    """What a client says first; the server may send so much of each answer."""
+    """The client's first bytes; the server may send so much of each answer."""
     return PREFACE + _frame(_SETTINGS, 0, 0, struct.pack(">HI", _INITIAL_WINDOW_SIZE, window_bytes))
 
 

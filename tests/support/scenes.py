@@ -26,7 +26,7 @@ def random_for(*case: object) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What to plant.
+    """The faults to plant.
 
     Attributes:
         point_count: scene points, uniform in the box.

@@ -131,7 +131,7 @@ def place_on(database: str, new_folder: Callable[[], Path]) -> Place:
 
 
 def faults_of(place: Place) -> tuple[str, ...]:
-    """What verification finds."""
+    """The findings of verification."""
     with closing(place.open_as_is()) as database, database.read() as connection:
         return verify(connection).faults
 
@@ -166,7 +166,7 @@ def make_descriptor(random: np.random.Generator, dimension: int) -> np.ndarray:
 
 
 def view_of(new: NewReference) -> View:
-    """What the one extractor found."""
+    """The features of the one extractor."""
     return new.views[EXTRACTOR]
 
 

@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 def with_enough_time(call: Callable[[float], T], *late: type[Exception]) -> T:
-    """What a call returns with the first of the limits 1, 2, 4, ... seconds within which this machine makes it."""
+    """The result of a call with the first of the limits 1, 2, 4, ... seconds within which this machine makes it."""
     for limit_s in (1.0, 2.0, 4.0, 8.0, 16.0):
         with suppress(*late):
             return call(limit_s)

@@ -1,4 +1,4 @@
-"""What the audit command prints and writes, of findings that need no server."""
+"""Output and files of the audit command, for findings that need no server."""
 
 import json
 from collections.abc import Iterator

@@ -116,7 +116,7 @@ def test_bench_without_scenes_is_one_line(tmp_path: Path, capsys: pytest.Capture
 
 
 KINECT = Camera(640, 480, 525.0, 525.0, 320.0, 240.0)
-"""What the reader of 7-Scenes takes, since the layout has no intrinsics."""
+"""The intrinsics that the reader of 7-Scenes assumes, since the layout has none."""
 CENTRED = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
 
 

@@ -230,7 +230,7 @@ print(json.dumps(found))
 
 
 def by_library(folder: Path, copy: Path, stand_ins: Path) -> dict[str, dict[str, object]]:
-    """What kapture's own library reads, its rigs resolved, by image; and a copy of the tables as it writes them."""
+    """Read by kapture's own library, its rigs resolved, by image; and a copy of the tables as it writes them."""
     if not (LIBRARY / "kapture").is_dir():
         pytest.skip(f"kapture's library is not in {LIBRARY}: make setup")
     stand_ins.mkdir()  # for a compiler of 200 MB, which speeds up one function

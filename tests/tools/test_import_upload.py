@@ -31,7 +31,7 @@ from mapless_tools.ingest.report import ImportReport
 from mapless_tools.ingest.upload import BATCH_COUNT, Uploader
 
 Fault = Callable[[Sequence[NewReference], int], MaplessError | None]
-"""What the server answers to a message and to which call, None to store it."""
+"""The server's answer to a message, and to which call; None to store it."""
 
 PARALLEL = 2
 

@@ -1,4 +1,4 @@
-"""What the viewer draws lies where it belongs, what it says is text, and it serves its own pages alone."""
+"""The viewer draws things where they belong, writes text as text, and serves its own pages alone."""
 
 import socket
 import threading

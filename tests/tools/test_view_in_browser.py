@@ -27,12 +27,12 @@ def view(address: str, scene: str) -> AbstractContextManager[str]:
 
 
 def like(picture: NDArray[np.uint8], colour: tuple[int, int, int], within: int = 60) -> NDArray[np.bool_]:
-    """Which pixels have about a colour."""
+    """The pixels that have about a colour."""
     return np.asarray(np.abs(picture.astype(int) - colour).max(axis=-1) < within)
 
 
 def canvas(page: Page) -> NDArray[np.uint8]:
-    """What is drawn, without the panel to the right and viser's messages above."""
+    """The drawing, without the panel to the right and viser's messages above."""
     return page.screenshot()[TOP_PX:, :830]
 
 

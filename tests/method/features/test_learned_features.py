@@ -80,7 +80,7 @@ def assert_is_well_formed(features: Features, dimension: int) -> None:
 
 
 def planted(score_map: Tensor) -> Maps:
-    """What ALIKED computes, with the same features everywhere."""
+    """ALIKED's output with the same features everywhere."""
     height, width = score_map.shape[2:]
     levels = [torch.ones(1, 32, height // step, width // step) for step in (1, 2, 8, 32)]
     return Maps(score_map, levels, (0, 0))

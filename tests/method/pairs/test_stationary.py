@@ -1,4 +1,4 @@
-"""What is fixed to the camera: found between references whose poses differ, and ignored; what poses predict is not."""
+"""Keypoints fixed to the camera are found between references with different poses; those that poses predict are not."""
 
 from dataclasses import replace
 from itertools import combinations
