@@ -193,8 +193,8 @@ def _stored(key: SceneKey, new: NewReference) -> ReferenceRecord:
     check_pose(new.world_from_camera)
     record = rows.new_record(key, new, _NOW)
     row = rows.reference_row(record)
-    camera, pose = codec.decode_geometry(record.key, row["geometry"], row["geometry_sha256"])
-    assert camera == new.camera
+    camera, pose, provenance = codec.decode_geometry(record.key, row["geometry"], row["geometry_sha256"])
+    assert (camera, provenance) == (new.camera, new.provenance)
     assert (pose.matrix() == new.world_from_camera.matrix()).all()
     return record
 

@@ -60,6 +60,7 @@ from .lenses import Fisheye, RadialTangential
 from .masks import IgnoredMask
 from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
+from .provenance import Provenance
 from .requests import IntrinsicsUncertainty, NewReference
 from .results import Coverage, Reference, ReferenceAudit, RetrievedReference, Scene
 from .scenes import UNCHANGED, Calibration
@@ -106,6 +107,7 @@ __all__ = [
     "PositionPrior",
     "PriorCheck",
     "Priors",
+    "Provenance",
     "Quaternion",
     "RadialTangential",
     "Reference",

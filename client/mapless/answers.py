@@ -30,7 +30,7 @@ class Accuracy:
     position_95_m: float
     rotation_68_deg: float
     rotation_95_deg: float
-    calibrated: bool
+    calibrated: bool = False
     calibration: str = "GENERIC"
     sample_size: int = 0
 

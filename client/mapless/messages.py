@@ -19,6 +19,7 @@ from .diagnostics import Attempt, Debug, Diagnostics
 from .geodesy import Datum, GeoPose
 from .geometry import Array, Camera, Quaternion, RigidTransform, Similarity
 from .groups import GroupRejected, ImageReport, RigLocalization, SequenceLocalization
+from .provenance import Provenance, provenance_from_message
 from .results import Reference, Scene
 from .scenes import Calibration, Vector, calibration_from_message, datum_from_message, direction_from_message
 from .v1 import localization_service_pb2 as pb
@@ -141,6 +142,7 @@ _READERS: dict[Any, Callable[[Any, str], Any]] = {
     Diagnostics: _diagnostics,
     GeoPose: _geo_pose,
     ImageReport: _image_report,
+    Provenance: provenance_from_message,
     RigidTransform: wire.transform_from_message,
     UsedIntrinsics: _used_intrinsics,
     Vector: direction_from_message,

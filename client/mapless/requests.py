@@ -7,6 +7,7 @@ from pathlib import Path
 from . import wire
 from .geometry import Camera, RigidTransform, nearest_rotation
 from .names import shown
+from .provenance import GIVEN_POSE, Provenance, provenance_to_message
 from .v1 import reference_service_pb2 as reference_pb
 
 ImageSource = bytes | str | os.PathLike[str]
@@ -17,7 +18,8 @@ ImageSource = bytes | str | os.PathLike[str]
 class NewReference:
     """A reference to be stored: id within the scene, photograph, its camera and its pose (metric).
 
-    The mask, a PNG of the photograph's size or its path, is 0 at the pixels to ignore; None: all are used.
+    The mask, a PNG of the photograph's size or its path, is 0 at the pixels to ignore; None: all are used. `provenance`
+    says how the pose is known.
     """
 
     reference_id: str
@@ -25,6 +27,7 @@ class NewReference:
     camera: Camera
     world_from_camera: RigidTransform
     mask: ImageSource | None = None
+    provenance: Provenance = GIVEN_POSE
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,7 @@ def create_request(
             intrinsics=wire.camera_to_message(reference.camera, f"{field}.camera"),
             world_from_camera=world_from_camera,
             mask=read_mask(reference.mask, f"{field}.mask"),
+            provenance=provenance_to_message(reference.provenance),
         ),
     )
 

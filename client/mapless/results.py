@@ -5,6 +5,7 @@ from datetime import datetime
 
 from .geodesy import Datum
 from .geometry import Camera, RigidTransform
+from .provenance import GIVEN_POSE, Provenance
 from .scenes import Calibration, Vector
 
 
@@ -56,6 +57,7 @@ class Reference:
         warnings: contradictions of the scene's datum, direction of gravity and unit and the poses stored in the same
             message, which `add_reference` and `add_references` found, and that the scene contradicts itself, as far as
             that was known; else empty.
+        provenance: how its pose is known.
     """
 
     scene_id: str
@@ -69,6 +71,7 @@ class Reference:
     warnings: tuple[str, ...] = ()
     mask: bytes | None = field(default=None, repr=False)
     mask_sha256: str = ""
+    provenance: Provenance = GIVEN_POSE
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +96,7 @@ class ReferenceAudit:
         position_offset_m, rotation_offset_deg: from the stored pose to the one estimated from neighbours; 0 if unknown.
         focal_ratio: focal length estimated from neighbours over the stored one; 0 if unknown.
         other: the reference it is swapped with or a duplicate of; else empty.
+        provenance: how its stored pose is known.
     """
 
     name: str
@@ -106,6 +110,7 @@ class ReferenceAudit:
     rotation_offset_deg: float
     focal_ratio: float
     other: str
+    provenance: Provenance = GIVEN_POSE
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mapless.cameras import with_slashes
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
+from mapless.provenance import GIVEN_POSE, Provenance
 from mapless.scenes import Vector, unit_vector
 from mapless.text_files import read_text
 from mapless_server.images import ImageLimits, decode_image, decode_mask, upright_of
@@ -36,7 +37,7 @@ class Frame:
 
     Its name is a legal reference id; the EXIF orientation of its file is not to be applied. The split is "train" for
     frames that a benchmark builds its references from, "test" for its queries, empty if unknown. The mask, a PNG of the
-    photograph's size, is 0 at the pixels to ignore; None without one.
+    photograph's size, is 0 at the pixels to ignore; None without one. `provenance` says how the pose is known.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Frame:
     world_from_camera: RigidTransform
     split: str = ""
     mask_path: Path | None = None
+    provenance: Provenance = GIVEN_POSE
 
     def __post_init__(self) -> None:
         if self.split not in SPLITS:

@@ -232,7 +232,7 @@ def test_stored_geometry_returns_bit_for_bit_or_is_damaged(
     pose = RigidTransform(np.reshape(motion[:9], (3, 3)), np.array(motion[9:]))
     stored = codec.encode_geometry(camera, pose)
     sha256 = codec.sha256_for("owner", stored)
-    again, its_pose = codec.decode_geometry("owner", stored, sha256)
+    again, its_pose, _ = codec.decode_geometry("owner", stored, sha256)
     assert repr(again) == repr(camera)
     assert its_pose.matrix().tobytes() == pose.matrix().tobytes()
     damaged = bytearray(stored)

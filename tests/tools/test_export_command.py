@@ -15,7 +15,7 @@ from support.layouts import CAMERA, assert_same_camera, assert_same_pose, by_nam
 from support.servers import RunningServer, serving
 from support.stores import damage
 
-from mapless import Client, Datum, NewReference, Scene
+from mapless import Accuracy, Client, Datum, NewReference, Provenance, Scene
 from mapless.geodesy import enu_from_y_up
 from mapless.lenses import Fisheye, RadialTangential
 from mapless_server.security import SceneKey
@@ -25,6 +25,7 @@ from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage, cameras_fi
 
 LENSES = (None, RadialTangential(0.1, -0.2, 0.01, 0.02, 0.3), Fisheye(0.1, 0.2, 0.3, 0.4))
 MASK = encode(".png", np.where(textured() > 90, 255, 0).astype(np.uint8))
+PLACED = Provenance("PLACED", Accuracy(0.01, 0.02, 0.3, 0.4))
 ENDINGS = (".png", ".jpg", ".webp")
 
 
@@ -39,6 +40,7 @@ def filled(client: Client) -> Iterator[tuple[str, list[NewReference]]]:
             replace(CAMERA, distortion=lens),
             truth().poses[i],
             MASK if i == 1 else None,
+            PLACED if i == 1 else Provenance(),
         )
         for i, (lens, ending) in enumerate(zip(LENSES, ENDINGS, strict=True))
     ]
@@ -61,6 +63,7 @@ def test_an_export_imports_as_the_same_scene(
         assert frame.image_path.name == reference.reference_id + ending
         assert frame.image_path.read_bytes() == reference.image
         assert (frame.mask_path and frame.mask_path.read_bytes()) == reference.mask
+        assert frame.provenance == (reference.provenance if layout == "cameras" else Provenance())
         assert_same_camera(frame.camera, reference.camera, px=1e-12)
         assert_same_pose(frame.world_from_camera, reference.world_from_camera, 1e-12)
     # Its own importer agrees: there is nothing to add to the scene that it came from.

@@ -14,6 +14,7 @@ from ..errors import MaplessError, NotFound
 from ..geometry import Array
 from ..messages import reference_from_message, scene_from_message
 from ..names import reference_name, scene_name
+from ..provenance import UNKNOWN, provenance_from_message
 from ..results import Reference, Scene
 from ..scenes import datum_from_message, direction_from_message
 from ..v1 import reference_service_pb2 as pb
@@ -57,7 +58,7 @@ async def stored_reference(wanted: pb.CreateReferenceRequest, connection: Connec
 
 
 def difference(wanted: pb.Reference, stored: Reference) -> str:
-    """First difference between references of one name: "photograph", "mask", "intrinsics", "pose"; empty if none."""
+    """First difference between references of one name, "photograph" or "pose" for instance; empty if none."""
     if stored.image_sha256 != hashlib.sha256(wanted.image).hexdigest():
         return "photograph"
     if stored.mask_sha256 != (hashlib.sha256(wanted.mask).hexdigest() if wanted.HasField("mask") else ""):
@@ -65,7 +66,10 @@ def difference(wanted: pb.Reference, stored: Reference) -> str:
     if wire.camera_to_message(stored.camera) != wanted.intrinsics:
         return "intrinsics"
     ours = wire.transform_from_message(wanted.world_from_camera, "").matrix()
-    return "" if np.allclose(ours, stored.world_from_camera.matrix(), rtol=0, atol=_SAME) else "pose"
+    if not np.allclose(ours, stored.world_from_camera.matrix(), rtol=0, atol=_SAME):
+        return "pose"
+    is_kept = stored.provenance.source != UNKNOWN
+    return "provenance" if is_kept and provenance_from_message(wanted.provenance, "") != stored.provenance else ""
 
 
 def _of_world(message: Any) -> Array:

@@ -10,6 +10,12 @@ from typing import ClassVar as _ClassVar, Iterable as _Iterable, Mapping as _Map
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class PoseSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    POSE_SOURCE_UNSPECIFIED: _ClassVar[PoseSource]
+    POSE_SOURCE_GIVEN: _ClassVar[PoseSource]
+    POSE_SOURCE_PLACED: _ClassVar[PoseSource]
+
 class AuditVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     AUDIT_VERDICT_UNSPECIFIED: _ClassVar[AuditVerdict]
@@ -28,6 +34,9 @@ class CoverageVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     COVERAGE_VERDICT_LOCALIZABLE: _ClassVar[CoverageVerdict]
     COVERAGE_VERDICT_DOUBTFUL: _ClassVar[CoverageVerdict]
     COVERAGE_VERDICT_NOT_LOCALIZABLE: _ClassVar[CoverageVerdict]
+POSE_SOURCE_UNSPECIFIED: PoseSource
+POSE_SOURCE_GIVEN: PoseSource
+POSE_SOURCE_PLACED: PoseSource
 AUDIT_VERDICT_UNSPECIFIED: AuditVerdict
 AUDIT_VERDICT_CONSISTENT: AuditVerdict
 AUDIT_VERDICT_WRONG_POSE: AuditVerdict
@@ -105,7 +114,7 @@ class SceneCalibration(_message.Message):
     def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., reference_noise_m: _Optional[float] = ..., reference_noise_deg: _Optional[float] = ..., grows_with_gap: bool = ...) -> None: ...
 
 class Reference(_message.Message):
-    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256")
+    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance")
     NAME_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
@@ -115,6 +124,7 @@ class Reference(_message.Message):
     FEATURE_COUNT_FIELD_NUMBER: _ClassVar[int]
     MASK_FIELD_NUMBER: _ClassVar[int]
     MASK_SHA256_FIELD_NUMBER: _ClassVar[int]
+    PROVENANCE_FIELD_NUMBER: _ClassVar[int]
     name: str
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
@@ -124,7 +134,16 @@ class Reference(_message.Message):
     feature_count: int
     mask: bytes
     mask_sha256: str
-    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ...) -> None: ...
+    provenance: Provenance
+    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ...) -> None: ...
+
+class Provenance(_message.Message):
+    __slots__ = ("source", "accuracy")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    ACCURACY_FIELD_NUMBER: _ClassVar[int]
+    source: PoseSource
+    accuracy: _localization_service_pb2.Accuracy
+    def __init__(self, source: _Optional[_Union[PoseSource, str]] = ..., accuracy: _Optional[_Union[_localization_service_pb2.Accuracy, _Mapping]] = ...) -> None: ...
 
 class CreateSceneRequest(_message.Message):
     __slots__ = ("scene_id", "datum", "down_in_world", "arbitrary_unit")
@@ -343,7 +362,7 @@ class AuditSceneResponse(_message.Message):
     def __init__(self, audits: _Optional[_Iterable[_Union[ReferenceAudit, _Mapping]]] = ..., next_page_token: _Optional[str] = ..., store_generation: _Optional[int] = ...) -> None: ...
 
 class ReferenceAudit(_message.Message):
-    __slots__ = ("name", "verdict", "message", "neighbour_count", "match_count", "inlier_count", "reprojection_error_px", "position_offset_m", "rotation_offset_deg", "focal_ratio", "other")
+    __slots__ = ("name", "verdict", "message", "neighbour_count", "match_count", "inlier_count", "reprojection_error_px", "position_offset_m", "rotation_offset_deg", "focal_ratio", "other", "provenance")
     NAME_FIELD_NUMBER: _ClassVar[int]
     VERDICT_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
@@ -355,6 +374,7 @@ class ReferenceAudit(_message.Message):
     ROTATION_OFFSET_DEG_FIELD_NUMBER: _ClassVar[int]
     FOCAL_RATIO_FIELD_NUMBER: _ClassVar[int]
     OTHER_FIELD_NUMBER: _ClassVar[int]
+    PROVENANCE_FIELD_NUMBER: _ClassVar[int]
     name: str
     verdict: AuditVerdict
     message: str
@@ -366,7 +386,8 @@ class ReferenceAudit(_message.Message):
     rotation_offset_deg: float
     focal_ratio: float
     other: str
-    def __init__(self, name: _Optional[str] = ..., verdict: _Optional[_Union[AuditVerdict, str]] = ..., message: _Optional[str] = ..., neighbour_count: _Optional[int] = ..., match_count: _Optional[int] = ..., inlier_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., position_offset_m: _Optional[float] = ..., rotation_offset_deg: _Optional[float] = ..., focal_ratio: _Optional[float] = ..., other: _Optional[str] = ...) -> None: ...
+    provenance: Provenance
+    def __init__(self, name: _Optional[str] = ..., verdict: _Optional[_Union[AuditVerdict, str]] = ..., message: _Optional[str] = ..., neighbour_count: _Optional[int] = ..., match_count: _Optional[int] = ..., inlier_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., position_offset_m: _Optional[float] = ..., rotation_offset_deg: _Optional[float] = ..., focal_ratio: _Optional[float] = ..., other: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ...) -> None: ...
 
 class CheckCoverageRequest(_message.Message):
     __slots__ = ("scene", "world_from_camera", "intrinsics")

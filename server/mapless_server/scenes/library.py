@@ -196,6 +196,7 @@ class ReferenceLibrary:
             reference_name(record.scene_id, record.reference_id),
             replace(view, photograph=photograph),
             record.world_from_camera,
+            provenance=record.provenance,
         )
 
     def _exif(self, record: ReferenceRecord) -> Exif:

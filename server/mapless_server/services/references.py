@@ -7,10 +7,11 @@ import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from mapless import names, wire
 from mapless.geometry import MAX_COORDINATE_M, RigidTransform
+from mapless.provenance import Provenance
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
@@ -46,6 +47,7 @@ from .messages.references import (
     changes_from_message,
     choice_to_message,
     nearly_ignored,
+    new_provenance,
     reference_to_message,
     scene_to_message,
 )
@@ -64,8 +66,15 @@ STORE_THREADS = 4  # writers share one lock; the other threads keep readers from
 
 T = TypeVar("T")
 M = TypeVar("M", pb.Scene, pb.Reference)
-Draft = tuple[str, Photo, RigidTransform]
-"""Reference id, photograph and world_from_camera."""
+
+
+class Draft(NamedTuple):
+    """A reference to be described and stored."""
+
+    reference_id: str
+    photo: Photo
+    world_from_camera: RigidTransform
+    provenance: Provenance
 
 
 class ReferenceService(rpcs.ReferenceServiceServicer):
@@ -308,28 +317,29 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             reference.world_from_camera, f"{path}.world_from_camera", MAX_COORDINATE_M
         )
         photo = photo_from_message(reference, path, self._engine().options.image_limits)
-        return reference_id, photo, world_from_camera
+        return Draft(reference_id, photo, world_from_camera, new_provenance(reference, path))
 
     async def _add(
         self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call
     ) -> tuple[Sequence[ReferenceRecord], list[str]]:
         """Stores references; returns their records, and contradictions of the scene's attributes."""
         # Describing takes long, so an unknown scene is rejected before. The store checks again when it adds.
-        added = [world_from_camera for _, _, world_from_camera in drafts]
+        added = [it.world_from_camera for it in drafts]
         warnings = await self._stored(self._contradictions_of_added, scene_key, added, call)
         call.note(scene=scene_key, references=len(drafts))
-        described = await self._engine().describe([photo for _, photo, _ in drafts], call.caller)
+        described = await self._engine().describe([it.photo for it in drafts], call.caller)
         references = [
             NewReference(
-                reference_id,
-                photo.image,
-                photo.camera,
-                world_from_camera,
+                it.reference_id,
+                it.photo.image,
+                it.photo.camera,
+                it.world_from_camera,
                 found.views,
                 found.descriptors,
-                photo.mask,
+                it.photo.mask,
+                it.provenance,
             )
-            for (reference_id, photo, world_from_camera), found in zip(drafts, described, strict=True)
+            for it, found in zip(drafts, described, strict=True)
         ]
         warnings += await self._stored(self._repeats, scene_key, drafts, call)
         records = await self._stored(self._store.add_references, scene_key, references)
@@ -354,8 +364,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         """Returns and logs which poses or photographs the references to be added repeat."""
         from mapless_server.scenes.repeats import PosedImage, repeats  # services do not load what computes
 
-        added = [PosedImage.of(reference_id, photo.image, pose) for reference_id, photo, pose in drafts]
-        posed = [(photo.camera, pose) for _, photo, pose in drafts]
+        added = [PosedImage.of(it.reference_id, it.photo.image, it.world_from_camera) for it in drafts]
+        posed = [(it.photo.camera, it.world_from_camera) for it in drafts]
         try:
             stored = self._store.list_alike(scene_key, {it.image_sha256 for it in added}, posed)
         except DataLoss as error:

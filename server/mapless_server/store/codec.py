@@ -43,6 +43,7 @@ from numpy.typing import NDArray
 from mapless.geodesy import Datum
 from mapless.geometry import Camera, Quaternion, RigidTransform
 from mapless.lenses import LENS_MODELS, Distortion, lens_model_of
+from mapless.provenance import GIVEN_POSE, Provenance, provenance_from_json, provenance_to_json
 from mapless.scenes import Calibration
 from mapless_server.method.features.views import Features, KeptDepth, Matches, View
 
@@ -71,14 +72,19 @@ def sha256_for(owner: str, data: bytes) -> str:
     return digest.hexdigest()
 
 
-def encode_geometry(camera: Camera, world_from_camera: RigidTransform) -> bytes:
-    """Camera and pose as JSON; ValueError if a number is not finite."""
+def encode_geometry(camera: Camera, world_from_camera: RigidTransform, provenance: Provenance = GIVEN_POSE) -> bytes:
+    """Camera, pose and how the pose is known as JSON; ValueError if a number is not finite.
+
+    A given pose of unknown accuracy is written as servers before 0.4 write it, who do not read the rest either.
+    """
     pose = {"rotation": world_from_camera.rotation.tolist(), "translation": world_from_camera.translation.tolist()}
-    return _to_json({"camera": _camera_to_dict(camera), "world_from_camera": pose})
+    known = provenance_to_json(provenance)
+    content = {"camera": _camera_to_dict(camera), "world_from_camera": pose}
+    return _to_json(content if known is None else content | {"provenance": known})
 
 
-def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, RigidTransform]:
-    """The camera and pose that `encode_geometry` was given; read-only arrays.
+def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, RigidTransform, Provenance]:
+    """The camera, pose and provenance that `encode_geometry` was given; read-only arrays.
 
     Damaged if the checksum or the form of the data is wrong.
     """
@@ -88,7 +94,8 @@ def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, Rigid
         rotation, translation = np.array(pose["rotation"], float), np.array(pose["translation"], float)
         rotation.setflags(write=False)
         translation.setflags(write=False)
-        return _camera_from_dict(content["camera"]), RigidTransform(rotation, translation)
+        provenance = provenance_from_json(content.get("provenance"))
+        return _camera_from_dict(content["camera"]), RigidTransform(rotation, translation), provenance
 
 
 def encode_attributes(attributes: SceneAttributes) -> bytes | None:

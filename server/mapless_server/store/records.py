@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
+from mapless.provenance import GIVEN_POSE, Provenance
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration, Vector
 from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
@@ -164,6 +165,7 @@ class NewReference:
             least one; the features of the first are counted.
         descriptors: global descriptors (D,) by name; stored as float16.
         mask: the bytes of its mask's file, unchanged; empty for none.
+        provenance: how its pose is known.
     """
 
     reference_id: str
@@ -173,6 +175,7 @@ class NewReference:
     views: Mapping[str, View]
     descriptors: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     mask: bytes = b""
+    provenance: Provenance = GIVEN_POSE
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +192,7 @@ class ReferenceRecord:
         feature_count: number of features that the first extractor found when it was added.
         create_time: when it was created, UTC.
         mask_sha256: hash of its mask's bytes, hexadecimal; empty without a mask.
+        provenance: how its pose is known.
     """
 
     scene_key: SceneKey
@@ -200,6 +204,7 @@ class ReferenceRecord:
     feature_count: int
     create_time: datetime
     mask_sha256: str = ""
+    provenance: Provenance = GIVEN_POSE
 
     @property
     def scene_id(self) -> str:

@@ -111,12 +111,13 @@ def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) ->
         feature_count=len(next(iter(new.views.values())).features),
         create_time=create_time,
         mask_sha256=hashlib.sha256(new.mask).hexdigest() if new.mask else "",
+        provenance=new.provenance,
     )
 
 
 def reference_row(record: ReferenceRecord) -> dict[str, Any]:
     """Makes a row of the table `reference`, without the generation; raises ValueError if a number is not finite."""
-    geometry = codec.encode_geometry(record.camera, record.world_from_camera)
+    geometry = codec.encode_geometry(record.camera, record.world_from_camera, record.provenance)
     return {
         "key": record.key,
         "scene_id": record.scene_key,
@@ -133,7 +134,7 @@ def reference_row(record: ReferenceRecord) -> dict[str, Any]:
 def reference_record(row: Row[Any]) -> ReferenceRecord:
     """Reads a row of the table `reference`; raises DataLoss if it is damaged."""
     try:
-        camera, world_from_camera = codec.decode_geometry(row.key, row.geometry, row.geometry_sha256)
+        camera, world_from_camera, provenance = codec.decode_geometry(row.key, row.geometry, row.geometry_sha256)
     except codec.Damaged as error:
         raise data_loss(row.reference_id, str(error)) from error
     return ReferenceRecord(
@@ -146,6 +147,7 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
         feature_count=row.feature_count,
         create_time=time_of(row.create_time_us),
         mask_sha256=row.mask_sha256 or "",
+        provenance=provenance,
     )
 
 

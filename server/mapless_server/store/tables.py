@@ -69,7 +69,7 @@ reference = Table(
     Column("key", _Key, primary_key=True),
     Column("scene_id", _SceneKey, ForeignKey("scene.scene_id", ondelete="CASCADE"), nullable=False),
     Column("reference_id", _Id, nullable=False),
-    Column("geometry", LargeBinary, nullable=False),  # camera and pose, see codec.py
+    Column("geometry", LargeBinary, nullable=False),  # camera, pose and its provenance, see codec.py
     Column("geometry_sha256", _Sha256, nullable=False),
     Column("image_sha256", _Sha256, nullable=False),
     Column("feature_count", Integer, nullable=False),

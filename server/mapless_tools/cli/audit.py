@@ -209,11 +209,27 @@ def cells_of(audit: ReferenceAudit) -> tuple[str, ...]:
         f"{100 * (1 / audit.focal_ratio - 1):+.1f}" if is_known else "-",
         f"{audit.inlier_count}/{audit.match_count}",
         f"{audit.reprojection_error_px:.1f}" if audit.reprojection_error_px else "-",
+        _placed_within(audit),
         audit.message,
     )
 
 
-COLUMNS = ("reference", "finding", "off, cm", "turned, deg", "focal, %", "agree", "error, px", "in words")
+def _placed_within(audit: ReferenceAudit) -> str:
+    accuracy = audit.provenance.accuracy
+    return "-" if accuracy is None else f"{100 * accuracy.position_95_m:.2g}"
+
+
+COLUMNS = (
+    "reference",
+    "finding",
+    "off, cm",
+    "turned, deg",
+    "focal, %",
+    "agree",
+    "error, px",
+    "placed within, cm",
+    "in words",
+)
 
 
 def table_of(audits: Sequence[ReferenceAudit]) -> Table:
@@ -222,7 +238,7 @@ def table_of(audits: Sequence[ReferenceAudit]) -> Table:
 
     table = Table()
     for i, column in enumerate(COLUMNS[:-1]):
-        table.add_column(column, justify="right" if 2 <= i <= 6 else "left", overflow="fold")
+        table.add_column(column, justify="right" if 2 <= i <= 7 else "left", overflow="fold")
     for audit in audits:
         style = "red" if audit.verdict in ALARMS else "" if audit.verdict == "CONSISTENT" else "yellow"
         table.add_row(*cells_of(audit)[:-1], style=style)

@@ -71,7 +71,9 @@ def plan_for(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
 def store_references(client: Client, scene: str, references: Sequence[Frame], progress: Progress) -> None:
     """Creates a scene with these references."""
     client.create_scene(scene)
-    new = (NewReference(f.name, f.image_path, f.camera, f.world_from_camera, f.mask_path) for f in references)
+    new = (
+        NewReference(f.name, f.image_path, f.camera, f.world_from_camera, f.mask_path, f.provenance) for f in references
+    )
     total = len(references)
     progress("storing references", 0, total)
     client.add_references(scene, new, on_progress=lambda done: progress("storing references", done, total))

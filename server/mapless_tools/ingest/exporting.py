@@ -56,7 +56,8 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
             mask.parent.mkdir(parents=True, exist_ok=True)
             with whole_file(mask) as file:
                 file.write_bytes(reference.mask)
-        return PosedImage(name, reference.camera, reference.world_from_camera, reference.mask is not None)
+        has_mask = reference.mask is not None
+        return PosedImage(name, reference.camera, reference.world_from_camera, has_mask, reference.provenance)
 
     known = client.get_scene(scene)
     images, damaged = fetch_all(client, scene, take, progress)

@@ -181,7 +181,7 @@ def read_item(frame: Frame, limits: ImageLimits = ANY_SIZE) -> Item:
             mask = frame.mask_path.read_bytes()
             check_mask(mask, (width, height), limits)
     digests = [hashlib.sha256(it).hexdigest() if it else "" for it in (image, mask)]
-    new = NewReference(frame.name, image, camera, frame.world_from_camera, mask)
+    new = NewReference(frame.name, image, camera, frame.world_from_camera, mask, frame.provenance)
     return new, Stored(frame.name, digests[0], camera, frame.world_from_camera, digests[1])
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Distortion, Fisheye, RadialTangential, lens_model_of
+from mapless.provenance import GIVEN_POSE, Provenance
 from mapless_server.images.exif import NO_EXIF, Exif
 
 Matches = NDArray[np.int32]
@@ -231,6 +232,7 @@ class PosedView:
         view: camera and features.
         world_from_camera: its pose, metric.
         depths: depths stored with it, if any.
+        provenance: how its pose is known.
     """
 
     key: str
@@ -238,6 +240,7 @@ class PosedView:
     view: View
     world_from_camera: RigidTransform
     depths: KeypointDepths | None = None
+    provenance: Provenance = GIVEN_POSE
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -108,7 +108,7 @@ class SceneAuditor:
         name = self._name(reference_id)
         try:
             tools, context = self._tools, StageContext(self._check)
-            tools.library.load(self._scene_key, [reference_id], tools.extractor, context)
+            _, (view,) = tools.library.load(self._scene_key, [reference_id], tools.extractor, context)
         except DataLoss:
             return ReferenceAudit(name, AuditVerdict.UNVERIFIABLE, DAMAGED)
         except NotFound as error:
@@ -125,7 +125,7 @@ class SceneAuditor:
         if self._auditor is None:
             finder = self._finder(entries.rows())
             self._auditor = Auditor(finder, self._tools.pairs, lambda: self._check())
-        return self._auditor.audit(name)
+        return replace(self._auditor.audit(name), provenance=view.provenance)
 
     def _check_coverage(self, view: Viewpoint) -> Coverage:
         entries = self._read()

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from mapless.geometry import Camera, RigidTransform
+from mapless.provenance import GIVEN_POSE, Provenance
 
 
 class AuditVerdict(str, Enum):
@@ -57,6 +58,7 @@ class ReferenceAudit:
         focal_ratio: fitted over given focal length; 1 if the given one fits.
         changed_share: share of the image that does not show what it should; None where not judged.
         other: name of the partner of a swap or duplicate; empty if there is none.
+        provenance: how its stored pose is known.
     """
 
     reference: str
@@ -71,6 +73,7 @@ class ReferenceAudit:
     focal_ratio: float | None = None
     changed_share: float | None = None
     other: str = ""
+    provenance: Provenance = GIVEN_POSE
 
 
 class CoverageVerdict(str, Enum):

@@ -3,9 +3,11 @@
 import base64
 import binascii
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 from mapless import names, wire
+from mapless.provenance import GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
 from mapless.scenes import (
     Calibration,
     calibration_from_message,
@@ -79,9 +81,22 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
         image_sha256=reference.image_sha256,
         feature_count=reference.feature_count,
         mask_sha256=reference.mask_sha256,
+        provenance=provenance_to_message(reference.provenance),
     )
     message.create_time.FromDatetime(reference.create_time)
     return message
+
+
+def new_provenance(reference: pb.Reference, field: str) -> Provenance:
+    """How the pose of a reference to be created is known; FieldError names what is wrong."""
+    if not reference.HasField("provenance"):
+        return GIVEN_POSE
+    message, path = reference.provenance, joined(field, "provenance")
+    sources: wire.ProtoEnum = pb.PoseSource
+    if message.source not in sources.values():
+        raise FieldError(joined(path, "source"), f"must be one of PoseSource's values, is {message.source}")
+    found = provenance_from_message(message, path)
+    return found if message.source else replace(found, source=GIVEN)
 
 
 MUCH_IGNORED = 0.8
@@ -115,7 +130,10 @@ def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesRes
 
 def audit_to_message(audit: ReferenceAudit) -> pb.ReferenceAudit:
     """Message of an audit; unknown values become 0."""
-    return message_of(audit, pb.ReferenceAudit, name=audit.reference, reprojection_error_px=audit.error_px)
+    known = provenance_to_message(audit.provenance)
+    return message_of(
+        audit, pb.ReferenceAudit, name=audit.reference, reprojection_error_px=audit.error_px, provenance=known
+    )
 
 
 def scene_to_message(scene: SceneRecord) -> pb.Scene:

@@ -3,10 +3,12 @@
 `cameras.json` holds ``frames``, a list of objects with ``image`` (path from the folder), ``width`` and ``height``,
 ``K`` (3x3, pixels, (0, 0) the centre of the top-left one), ``dist`` (OpenCV's k1 k2 p1 p2 [k3], or null) and
 ``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test"),
-``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4) and ``mask`` (path of a PNG that is 0 at the pixels to
-ignore); and beside them ``metric`` (false: the unit of length is arbitrary), ``source``, ``ground_truth``, ``datum``
-(where the world is on the Earth, `mapless.geodesy.Datum`: ``latitude_deg``, ``longitude_deg``,
-``height_m``, perhaps ``enu_from_world`` with ``x y z w``) and ``down_in_world``.
+``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4), ``mask`` (path of a PNG that is 0 at the pixels to
+ignore) and ``provenance`` (how the pose is known: ``source``, "given" or "placed", and the radii of its errors,
+``position_68_m``, ``position_95_m``, ``rotation_68_deg``, ``rotation_95_deg``); and beside them ``metric`` (false: the
+unit of length is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the Earth,
+`mapless.geodesy.Datum`: ``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with
+``x y z w``) and ``down_in_world``.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,6 +21,7 @@ from typing import Any
 
 from mapless.cameras import FOLDER_FILE, camera_of_frame
 from mapless.geometry import RigidTransform
+from mapless.provenance import provenance_from_json
 from mapless_tools.dataset import Dataset, finite_numbers, image_file, named, printable, read_json, read_place
 
 from .collecting import Collector, ReadOptions
@@ -93,5 +96,8 @@ def add_frame(collector: Collector, entry: Any, names: Mapping[Path, str] = Mapp
     camera = camera_of_frame(entry)
     if not (camera.focal_x_px > 0 and camera.focal_y_px > 0):
         raise ValueError(f"K: focal lengths must be above 0, are {camera.focal_x_px:g} and {camera.focal_y_px:g}")
+    with named("provenance"):
+        provenance = provenance_from_json(entry.get("provenance"))
     file = collector.image(image)
-    collector.add(image, camera, pose, entry.get("split", ""), names.get(file, file.stem), entry.get("mask"))
+    name = names.get(file, file.stem)
+    collector.add(image, camera, pose, entry.get("split", ""), name, entry.get("mask"), provenance)

@@ -14,6 +14,7 @@ import numpy as np
 
 from mapless.cameras import MAX_SIDE_PX
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
+from mapless.provenance import GIVEN_POSE, Provenance
 from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ANY_SIZE, image_size
@@ -120,6 +121,7 @@ class Collector:
         split: str = "",
         name: str = "",
         mask: str | None = None,
+        provenance: Provenance = GIVEN_POSE,
     ) -> None:
         """Adds a frame; ValueError names what is wrong.
 
@@ -133,7 +135,8 @@ class Collector:
         # The folders belong to the id: sequences count their frames from 0, each of them.
         parts = PurePosixPath(name or file.relative_to(self.folder).with_suffix("")).parts
         identifier = legal_id("_".join(parts), self._ids)
-        self.frames.append(Frame(identifier, file, camera, world_from_camera, split, self._mask(mask)))
+        frame = Frame(identifier, file, camera, world_from_camera, split, self._mask(mask), provenance)
+        self.frames.append(frame)
         self._ids.add(identifier)
         self._images.add(file)
 

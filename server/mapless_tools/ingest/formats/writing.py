@@ -11,6 +11,7 @@ from mapless.geometry import Camera, RigidTransform
 from mapless.lenses import DEFAULT_LENS_MODEL, lens_model_of
 from mapless.masks import FOLDER as MASKS
 from mapless.masks import mask_name
+from mapless.provenance import GIVEN_POSE, Provenance, provenance_to_json
 
 from .colmap.cameras import from_camera
 from .kapture import PROPERTIES
@@ -22,13 +23,15 @@ IMAGES = "images"
 class PosedImage:
     """An image that is stored under `name` in the layout's folder of images, with its camera and pose.
 
-    If it `has_mask`, that is stored in the folder `mapless.masks.FOLDER` under COLMAP's name.
+    If it `has_mask`, that is stored in the folder `mapless.masks.FOLDER` under COLMAP's name. `provenance` says how the
+    pose is known; only `cameras.json` has it.
     """
 
     name: str
     camera: Camera
     world_from_camera: RigidTransform
     has_mask: bool = False
+    provenance: Provenance = GIVEN_POSE
 
 
 Describe = Callable[..., dict[str, str]]
@@ -130,6 +133,8 @@ def _entry(image: PosedImage) -> dict[str, Any]:
     }
     if image.has_mask:
         entry["mask"] = f"{MASKS}/{mask_name(image.name)}"
+    if provenance := provenance_to_json(image.provenance):
+        entry["provenance"] = provenance
     model = DEFAULT_LENS_MODEL if lens is None else lens_model_of(lens)
     return entry if model == DEFAULT_LENS_MODEL else entry | {"lens": model}
 
