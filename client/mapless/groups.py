@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from .answers import Accuracy, Hint, Hypothesis, PriorCheck, pose_lines, rejection_text
+from .answers import Accuracy, Hint, Hypothesis, PriorCheck, UsedIntrinsics, pose_lines, rejection_text
 from .axes import Axes, pose_to
 from .diagnostics import Diagnostics
 from .geodesy import GeoPose
@@ -18,7 +18,8 @@ class RigImage:
 
     Attributes:
         image: the photograph.
-        camera: its camera, in pixels of the file as it is stored, before any EXIF rotation.
+        camera: its camera, in pixels of the file as it is stored, before any EXIF rotation; None if it is not known:
+            the server then finds it, one for all images with the same make, model and size in their EXIF.
         rig_from_camera: pose of the camera in the rig, metres, OpenCV's axes; the rig's frame is arbitrary.
         references: the references to use, at most 64; empty: the server chooses.
         priors: priors on this camera's pose; soft ones are terms of the joint estimate.
@@ -26,7 +27,7 @@ class RigImage:
     """
 
     image: ImageSource
-    camera: Camera
+    camera: Camera | None
     rig_from_camera: RigidTransform
     references: tuple[str, ...] = ()
     priors: Priors = field(default_factory=Priors)
@@ -39,7 +40,8 @@ class SequenceFrame:
 
     Attributes:
         image: the photograph.
-        camera: its camera, in pixels of the file as it is stored, before any EXIF rotation.
+        camera: its camera, in pixels of the file as it is stored, before any EXIF rotation; None if it is not known:
+            the server then finds one for all frames without.
         session_from_camera: the pose that the device tracked, in the axes of the call.
         capture_time: time of the photograph, with time zone.
         references: the references to use, at most 64; empty: the server chooses.
@@ -48,7 +50,7 @@ class SequenceFrame:
     """
 
     image: ImageSource
-    camera: Camera
+    camera: Camera | None
     session_from_camera: RigidTransform
     capture_time: datetime | None = None
     references: tuple[str, ...] = ()
@@ -67,6 +69,8 @@ class ImageReport:
         diagnostics: its inputs and times.
         prior_checks: how the joint pose compares with each of its soft priors.
         hypotheses_alone: as of `Rejected`, if it is rejected alone.
+        used_intrinsics: the intrinsics with which the joint pose was computed; None if none were given or found, and
+            from older servers.
     """
 
     inlier_count: int
@@ -75,6 +79,7 @@ class ImageReport:
     diagnostics: Diagnostics
     prior_checks: tuple[PriorCheck, ...] = ()
     hypotheses_alone: tuple[Hypothesis, ...] = ()
+    used_intrinsics: UsedIntrinsics | None = None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import io
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +12,20 @@ from support.corner import CAMERA, make_corner, photograph, pose
 from support.images import encode, textured
 from support.servers import serving_really
 
-from mapless import Camera, Client, IntrinsicsUncertainty, InvalidArgument, LocalizationResult, NewReference, Rejected
+from mapless import (
+    Camera,
+    Client,
+    GroupRejected,
+    IntrinsicsUncertainty,
+    InvalidArgument,
+    LocalizationResult,
+    NewReference,
+    Rejected,
+    RigImage,
+    RigLocalization,
+    SequenceFrame,
+    SequenceLocalization,
+)
 
 SQUARE = Camera.centred(420, 420, 352.0)
 """Other sides than those of the references."""
@@ -105,3 +118,78 @@ def test_an_uncertainty_is_that_of_intrinsics(client: Client) -> None:
     with pytest.raises(InvalidArgument) as raised:
         client.localize(photograph(THERE), scene="corner", intrinsics_uncertainty=IntrinsicsUncertainty(3.0))
     assert raised.value.field == "intrinsics_uncertainty"
+
+
+WALK = [pose(angle) for angle in (-8.0, -3.0, 2.0, 7.0)]
+OTHER = replace(SQUARE, focal_x_px=380.0, focal_y_px=380.0)
+
+
+def groups_of(cameras: Sequence[Camera | None], images: Sequence[bytes]) -> tuple[list[RigImage], list[SequenceFrame]]:
+    """The photographs of the walk as a rig, whose frame is the world's, and as a sequence."""
+    rig = [RigImage(image, camera, at) for image, camera, at in zip(images, cameras, WALK, strict=True)]
+    frames = [SequenceFrame(image, camera, at) for image, camera, at in zip(images, cameras, WALK, strict=True)]
+    return rig, frames
+
+
+def test_a_sequence_has_one_unknown_camera(client: Client) -> None:
+    """A frame that is not localized alone has it, too."""
+    images = [photograph(it, SQUARE) for it in WALK]
+    images[1] = encode(".png", textured(420, 420, seed=5))
+    frames = groups_of([None] * 4, images)[1]
+    answer = client.localize_sequence(frames, "corner")
+    assert isinstance(answer, SequenceLocalization), answer
+    used = {(it.source, it.camera, it.focal_sigma_px) for it in (r.used_intrinsics for r in answer.images) if it}
+    ((source, camera, sigma_px),) = used
+    assert source == "ESTIMATED"
+    assert abs(camera.focal_x_px - SQUARE.focal_x_px) < min(3 * sigma_px, 0.02 * SQUARE.focal_x_px)
+    off_m = math.dist(answer.world_from_camera[-1].translation, WALK[-1].translation)
+    assert off_m < min(0.1, answer.accuracy.position_95_m)
+
+
+def test_joint_radii_contain_what_the_camera_may_be_off(client: Client) -> None:
+    images = [photograph(it, SQUARE) for it in WALK]
+    radii_m = list[float]()
+    for camera in (SQUARE, None):
+        rig, frames = groups_of([camera] * 4, images)
+        answers = client.localize_rig(rig, "corner"), client.localize_sequence(frames, "corner")
+        for answer in answers:
+            assert isinstance(answer, RigLocalization | SequenceLocalization), answer
+            radii_m.append(answer.accuracy.position_68_m)
+    assert radii_m[2] > radii_m[0]
+    assert radii_m[3] > radii_m[1]
+
+
+def test_images_of_a_rig_share_the_camera_of_equal_exif(client: Client) -> None:
+    """Those without EXIF, or of another model, have cameras of their own; that of a given one is as given."""
+    wide = replace(CAMERA, focal_x_px=350.0, focal_y_px=350.0)
+    images = [photograph(at, it) for at, it in zip(WALK, (wide, wide, OTHER, OTHER), strict=True)]
+    images[:2] = [with_exif(it, film_mm(wide), "A") for it in images[:2]]
+    answer = client.localize_rig(groups_of([None, None, None, OTHER], images)[0], "corner")
+    assert isinstance(answer, RigLocalization), answer
+    used = [it.used_intrinsics for it in answer.images]
+    assert [it and it.source for it in used] == ["EXIF", "EXIF", "ESTIMATED", "GIVEN"]
+    focal_px = [it.camera.focal_x_px for it in used if it]
+    assert focal_px[0] == focal_px[1] == pytest.approx(wide.focal_x_px, rel=0.02)
+    assert focal_px[2] == pytest.approx(OTHER.focal_x_px, rel=0.02)
+    assert math.dist(answer.world_from_rig.translation, (0.0, 0.0, 0.0)) < answer.accuracy.position_95_m
+
+
+def test_photographs_of_a_camera_that_none_determines_are_left_out(client: Client) -> None:
+    images = [photograph(WALK[0], SQUARE), *[encode(".png", textured(420, 420, seed=i)) for i in range(3)]]
+    rig, frames = groups_of([SQUARE, None, None, None], images)
+    answer = client.localize_rig(rig, "corner")
+    assert isinstance(answer, RigLocalization), answer
+    assert [it.used_intrinsics is not None for it in answer.images] == [True, False, False, False]
+    assert [it.match_count for it in answer.images[1:]] == [0, 0, 0]
+    unknown = client.localize_sequence([replace(it, camera=None) for it in frames[1:]], "corner")
+    assert isinstance(unknown, GroupRejected)
+    assert "focal length" in unknown.message
+    assert unknown.hint is not None
+    assert unknown.hint.advice == "CHECK_CALIBRATION"
+
+
+def test_frames_of_one_camera_have_one_size(client: Client) -> None:
+    frames = groups_of([None] * 4, [photograph(WALK[0]), *[photograph(it, SQUARE) for it in WALK[1:]]])[1]
+    with pytest.raises(InvalidArgument) as raised:
+        client.localize_sequence(frames, "corner")
+    assert raised.value.field == "frames[1].intrinsics"

@@ -145,7 +145,7 @@ BAD: dict[str, list[Case]] = {
         ("images[2].rig_from_camera.translation_m.y", NAN),
         ("images[2].rig_from_camera.translation_m.y", 1e8),
         ("images[0].rig_from_camera.rotation", ZERO),
-        ("images[2].intrinsics", None),
+        ("images[2].intrinsics.width_px", 97),
         ("images[1].image", b"<svg/>"),
         ("images[1].mask", b""),
         ("images[1].references", ["scenes/other/references/r1"], "images[1].references[0]"),

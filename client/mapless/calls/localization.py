@@ -288,7 +288,8 @@ def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: s
     mask = read_mask(given.mask, f"{field}.mask")
     if mask is not None:
         message.mask = mask
-    message.intrinsics.CopyFrom(wire.camera_to_message(given.camera, f"{field}.camera"))
+    if given.camera is not None:
+        message.intrinsics.CopyFrom(wire.camera_to_message(given.camera, f"{field}.camera"))
     message.references.extend(reference_names(scene, given.references))
     set_priors(message, given.priors, f"{field}.priors")
     return message

@@ -729,18 +729,20 @@ class RigLocalization(_message.Message):
     def __init__(self, world_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., world_from_session: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., arbitrary_unit: bool = ..., trust: _Optional[float] = ...) -> None: ...
 
 class ImageReport(_message.Message):
-    __slots__ = ("inlier_count", "match_count", "alone", "diagnostics", "prior_checks")
+    __slots__ = ("inlier_count", "match_count", "alone", "diagnostics", "prior_checks", "used_intrinsics")
     INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
     MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
     ALONE_FIELD_NUMBER: _ClassVar[int]
     DIAGNOSTICS_FIELD_NUMBER: _ClassVar[int]
     PRIOR_CHECKS_FIELD_NUMBER: _ClassVar[int]
+    USED_INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     inlier_count: int
     match_count: int
     alone: Rejection
     diagnostics: Diagnostics
     prior_checks: _containers.RepeatedCompositeFieldContainer[PriorCheck]
-    def __init__(self, inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., alone: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ...) -> None: ...
+    used_intrinsics: UsedIntrinsics
+    def __init__(self, inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., alone: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., used_intrinsics: _Optional[_Union[UsedIntrinsics, _Mapping]] = ...) -> None: ...
 
 class LocalizeSequenceRequest(_message.Message):
     __slots__ = ("scene", "frames", "estimate_session_scale", "options")

@@ -52,6 +52,17 @@ class GroupResult:
     seconds: tuple[float, ...]
     processor_s: tuple[float, ...]
 
+    def and_then(self, indices: Sequence[int], later: GroupResult) -> GroupResult:
+        """The results after some photographs, by their indices, were localized again: theirs are the later ones."""
+        row = dict(zip(indices, range(len(indices)), strict=True))
+        results = tuple(later.results[row[i]] if i in row else it for i, it in enumerate(self.results))
+
+        def total(before: tuple[float, ...], after: tuple[float, ...]) -> tuple[float, ...]:
+            return tuple(it + (after[row[i]] if i in row else 0.0) for i, it in enumerate(before))
+
+        queued_s, seconds = total(self.queued_s, later.queued_s), total(self.seconds, later.seconds)
+        return GroupResult(results, queued_s, seconds, total(self.processor_s, later.processor_s))
+
 
 class PhotoGroup:
     """The photographs of a call that are localized one by one.

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -215,12 +216,12 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         queries: Sequence[Query],
         call: Call,
         list_name: str,
-        pose: Callable[[Sequence[Query], Sequence[Result]], Joint],
-    ) -> tuple[GroupResult, Joint]:
+        pose: Callable[[Sequence[Query], Sequence[Result]], Joint | Rejection],
+    ) -> tuple[GroupResult, Joint | Rejection]:
         """`localize_group` within the engine's queue, with memory for all of the photographs."""
         engine = self._engine()
 
-        async def posed(asked: Sequence[Query], results: Sequence[Result]) -> Joint:
+        async def posed(asked: Sequence[Query], results: Sequence[Result]) -> Joint | Rejection:
             self._count_attempts(results)  # also of a round that is not answered
             return await engine.join(partial(pose, asked, results), call.caller)
 
@@ -285,23 +286,58 @@ async def localize_group(
     queries: Sequence[Query],
     call: Call,
     list_name: str,
-    pose: Callable[[Sequence[Query], Sequence[Result]], Awaitable[Joint]],
-) -> tuple[GroupResult, Joint]:
+    pose: Callable[[Sequence[Query], Sequence[Result]], Awaitable[Joint | Rejection]],
+) -> tuple[GroupResult, Joint | Rejection]:
     """Localizes the photographs of a rig or a sequence, and computes their joint `pose`.
 
     After a rejection the ladder says whether all of them are localized again; if that fails, the rejection stays.
     """
-    group = await localize_photographs(engine, queries, call, list_name)
-    outcome = await pose(queries, group.results)
-    elsewhere = after_rejection(queries, outcome) if isinstance(outcome, Rejection) else None
+    asked, group = await localize_with_cameras(engine, queries, call, list_name)
+    outcome = await _posed(asked, group, pose)
+    elsewhere = after_rejection(asked, outcome) if isinstance(outcome, Rejection) else None
     if elsewhere is None:
         return group, outcome
     try:
-        again = await localize_photographs(engine, elsewhere, call, list_name)
-        found = await pose(elsewhere, again.results)
+        asked, again = await localize_with_cameras(engine, elsewhere, call, list_name)
+        found = await _posed(asked, again, pose)
     except RequestError:  # a failed attempt at a better answer must not cost the first one
         return group, outcome
     return (group, outcome) if isinstance(found, Rejection) else (again, found)
+
+
+async def _posed(
+    queries: Sequence[Query],
+    group: GroupResult,
+    pose: Callable[[Sequence[Query], Sequence[Result]], Awaitable[Joint | Rejection]],
+) -> Joint | Rejection:
+    """The joint pose; the rejection of a photograph if the camera of none of them is known."""
+    if all(it.photo.exif is not None for it in queries):
+        unknown = group.results[0].answer.outcome
+        assert isinstance(unknown, Rejection)
+        return unknown
+    return await pose(queries, group.results)
+
+
+async def localize_with_cameras(
+    engine: QueueEngine, queries: Sequence[Query], call: Call, list_name: str
+) -> tuple[Sequence[Query], GroupResult]:
+    """Localizes each photograph; those without intrinsics again, with the camera that all those of one camera have.
+
+    Returns the queries with these cameras; photographs whose camera is not known are rejected, without matches.
+    """
+    group = await localize_photographs(engine, queries, call, list_name)
+    if all(it.photo.exif is None for it in queries):
+        return queries, group
+    from mapless_server.engine import group_cameras  # services do not load what computes
+
+    cameras = group_cameras.common_cameras(queries, group.results, is_sequence=list_name == "frames")
+    asked = [group_cameras.read_with(query, cameras.get(i)) for i, query in enumerate(queries)]
+    again = group_cameras.read_otherwise(group.results, cameras)
+    if again:
+        later = await localize_photographs(engine, [asked[i] for i in again], call, list_name)
+        group = group.and_then(again, later)
+    results = [group_cameras.answered(it, i, cameras) for i, it in enumerate(group.results)]
+    return asked, replace(group, results=tuple(results))
 
 
 async def localize_photographs(

@@ -51,8 +51,7 @@ class Comparison:
 def compare(then: Response, now: Response) -> Comparison:
     """Compares a captured answer with a new one."""
     first, second = _essence(then), _essence(now)
-    if isinstance(then, pb.LocalizeResponse):
-        before, after = (getattr(it, it.WhichOneof("outcome") or "rejection") for it in (first, second))
+    for before, after in zip(_with_intrinsics(first), _with_intrinsics(second), strict=False):
         # Servers before 0.4 do not send it.
         if after.HasField("used_intrinsics") and not before.HasField("used_intrinsics"):
             after.ClearField("used_intrinsics")
@@ -60,6 +59,13 @@ def compare(then: Response, now: Response) -> Comparison:
         return Comparison(True)
     was, is_now = (dict(_leaves(MessageToDict(it, preserving_proto_field_name=True))) for it in (first, second))
     return Comparison(False, tuple(changed(was, is_now)[:MAX_CHANGES]), *_apart(first, second))
+
+
+def _with_intrinsics(response: Response) -> list[Any]:
+    """The messages of a response that have the intrinsics of a photograph."""
+    if isinstance(response, pb.LocalizeResponse):
+        return [getattr(response, response.WhichOneof("outcome") or "rejection")]
+    return list(response.images)
 
 
 def changed(then: Mapping[str, str], now: Mapping[str, str]) -> list[Change]:

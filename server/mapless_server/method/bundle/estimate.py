@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 
-from mapless.geometry import Array, RigidTransform
+from mapless.geometry import Array, Camera, RigidTransform
 
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..significance import HEAVY_TAIL
@@ -154,6 +154,20 @@ class PosedSupport(Support):
         if self.two_view is not None:
             seen = np.concatenate([seen, self.two_view.reference[self.two_view.inliers]])
         return tuple(np.bincount(seen, minlength=len(self.references)).tolist())
+
+
+def determined_intrinsics(support: PosedSupport) -> tuple[Camera, IntrinsicsSigma] | None:
+    """The camera that a photograph was read with, in its pixels as sent, and standard deviations after its matches.
+
+    None where the pose has no evidence about the intrinsics.
+    """
+    evidence, photograph = support.estimate.intrinsics, support.query.photograph
+    if evidence is None:
+        return None
+    focal, x_px, y_px, k1 = np.sqrt(np.diag(evidence.covariance)).tolist()
+    shares = focal, max(x_px, y_px) / evidence.given.width_px, k1
+    sigma = IntrinsicsSigma(*(min(1.0, it) for it in shares))
+    return photograph.camera if photograph else evidence.sent, sigma
 
 
 def observers(structure: Structure, points: NDArray[np.intp]) -> NDArray[np.intp]:

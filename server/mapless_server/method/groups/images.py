@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import Support, observers
-from ..bundle.priors import NO_PRIORS, Priors
+from ..bundle.priors import NO_PRIORS, IntrinsicsSigma, Priors
 from ..features.limits import INLIER_PX
 from ..judge.answer import Answer, Localization
 from ..judge.evidence import findable_count, hull_share
@@ -44,11 +44,14 @@ class GroupImage:
         answer: the photograph's own answer; the group uses its `support`.
         match: options of the guided search.
         priors: priors on its camera's pose.
+        intrinsics: standard deviations of its intrinsics, which the joint covariance contains; None if it contains
+            none, for intrinsics that were given.
     """
 
     answer: Answer
     match: MatchOptions
     priors: Priors = NO_PRIORS
+    intrinsics: IntrinsicsSigma | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -145,6 +148,7 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
         matches=support.matches.select(is_kept),
         origin=origin,
         query_matches=support.query_matches,
+        intrinsics_sigma=image.intrinsics,
         reference_error_px=support.reference_error_px,
         image=index,
         own_pose=own_pose,

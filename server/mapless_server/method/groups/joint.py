@@ -89,7 +89,9 @@ def adjust_jointly(
     """
     problem = GroupProblem(matched_images, matches, state, priors)
     point = minimize(problem, problem.start, STEPS) if problem.blocks else problem.start
-    points = {block.image: (block.chosen, moved) for block, moved in zip(problem.blocks, point.points, strict=True)}
+    points = {
+        block.source.image: (block.chosen, moved) for block, moved in zip(problem.blocks, point.points, strict=True)
+    }
     matched = []
     for source, its_matches in zip(matched_images, matches, strict=True):
         x_in_world = source.structure.x_in_world

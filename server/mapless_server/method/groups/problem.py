@@ -1,8 +1,8 @@
 """The cost of a group of photographs and its derivatives; see `joint`."""
 
 import itertools
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
@@ -13,7 +13,7 @@ from mapless.geometry import Array, RigidTransform
 
 from ..bundle.bundle import BundleProblem, free_problem
 from ..bundle.normal_equations import Bundle, Linearized, NormalEquations, Poses
-from ..bundle.pose_problem import AdjustOptions, most_probable, pose_errors
+from ..bundle.pose_problem import AdjustOptions, most_probable, pose_errors, with_intrinsics
 from ..bundle.priors import Priors
 from ..features.tracks import Tracks
 from ..features.views import PosedView
@@ -111,7 +111,7 @@ class ImageBlock:
     """One photograph's part of the problem: as in `adjust`, without the prior, which the group has.
 
     Attributes:
-        image: index of the photograph in the group.
+        source: the photograph.
         chosen: (P_b,) indices of its points in the photograph's structure.
         problem: the cost and its derivatives.
         references: (V - 1,) index of each of its references in the group; the last camera is the photograph.
@@ -119,7 +119,7 @@ class ImageBlock:
         depth_m: median depth of its points, metres.
     """
 
-    image: int
+    source: MatchedImage
     chosen: NDArray[np.intp]
     problem: BundleProblem
     references: NDArray[np.intp]
@@ -132,7 +132,7 @@ class ImageBlock:
         columns = np.zeros((6 * local + 6, 6 * reference_count + state.size))
         for row, reference in enumerate(self.references):
             columns[6 * row : 6 * row + 6, 6 * reference : 6 * reference + 6] = np.eye(6)
-        columns[-6:, 6 * reference_count :] = state.jacobian(self.image)
+        columns[-6:, 6 * reference_count :] = state.jacobian(self.source.image)
         return columns
 
 
@@ -146,7 +146,7 @@ class Point(Generic[S]):
 
     def bundle(self, index: int, block: ImageBlock) -> Bundle:
         """Returns the values of one block."""
-        last = self.state.camera_from_world(block.image)
+        last = self.state.camera_from_world(block.source.image)
         return Bundle(self.references[block.references].and_last(last), self.points[index])
 
     def at(self, index: int, block: ImageBlock) -> Linearized:
@@ -192,7 +192,7 @@ class GroupProblem(Generic[S]):
         problem, _, depth_m = free_problem(part.tracks, views, structure, part.chosen, loss_scale, times_used=times)
         known = self._references
         references = np.array([known.setdefault(it.key, (len(known), it))[0] for it in source.references])
-        return ImageBlock(source.image, part.chosen, problem, references, structure.noise.level_px, depth_m)
+        return ImageBlock(source, part.chosen, problem, references, structure.noise.level_px, depth_m)
 
     def _reference_information(self) -> Array:
         """Inverse covariance (6 R, 6 R) of the priors on the references' poses (see `pose_problem`).
@@ -212,7 +212,7 @@ class GroupProblem(Generic[S]):
         errors = pose_errors(its.centres, its.rotation, centre, *size, observing)
         matrix, gradient, _ = block.problem.linearize(block.problem.at(bundle)).reduced(LEAST_DAMPING)
         own, drift = most_probable(errors, matrix, gradient)
-        last = self.start.state.camera_from_world(self.blocks[-1].image).inverse().translation
+        last = self.start.state.camera_from_world(self.blocks[-1].source.image).inverse().translation
         errors = pose_errors(given.centres, given.rotation, last, *size, block.references[observing])
         return np.asarray(np.linalg.inv(errors.covariance(own, drift)), np.float64)
 
@@ -250,7 +250,7 @@ class GroupProblem(Generic[S]):
             return None
         points = []
         for i, ((_, _, eliminated), its_columns) in enumerate(zip(reduced, columns, strict=True)):
-            centre = point.state.camera_from_world(self.blocks[i].image).inverse().translation
+            centre = point.state.camera_from_world(self.blocks[i].source.image).inverse().translation
             points.append(_stepped(point.points[i], eliminated.steps(its_columns @ step), centre))
         references = point.references.moved(step[: 6 * self.reference_count].reshape(-1, 6))
         return Point(references, tuple(points), point.state.moved(step[6 * self.reference_count :]))
@@ -289,7 +289,37 @@ class GroupProblem(Generic[S]):
         hessian = matrix[references:, references:]
         if references:
             hessian = hessian - coupling.T @ np.linalg.solve(matrix[:references, :references], coupling)
-        return _inverse(hessian)
+        covariance = _inverse(hessian)
+        for by_errors, variances in self._by_intrinsics(point):
+            gradient = by_errors[references:] / inflation**2
+            if references:
+                known = np.linalg.solve(matrix[:references, :references], by_errors[:references] / inflation**2)
+                gradient = gradient - coupling.T @ known
+            motion = covariance @ gradient
+            covariance = covariance + (motion * variances) @ motion.T
+        return covariance
+
+    def _by_intrinsics(self, point: Point[S]) -> Iterator[tuple[Array, Array]]:
+        """For each camera whose intrinsics are uncertain: derivatives (U, 4) of the gradient by their errors.
+
+        Also the variances (4,) of these. Photographs of equal intrinsics and uncertainty have the same errors.
+        """
+        cameras = defaultdict[object, list[int]](list)
+        for i, block in enumerate(self.blocks):
+            if block.source.intrinsics_sigma is not None:
+                query = block.source.query
+                cameras[query.camera, query.distortion, block.source.intrinsics_sigma].append(i)
+        for indices in cameras.values():
+            total = np.zeros((6 * self.reference_count + point.state.size, 4))
+            for i in indices:
+                block = self.blocks[i]
+                wider, bundle = with_intrinsics(block.problem, point.bundle(i, block), block.source.query)
+                matrix, _, _ = wider.linearize(wider.at(bundle)).reduced(0.0)
+                columns = block.columns(self.reference_count, point.state)
+                total += columns.T @ matrix[: len(columns), len(columns) :]
+            source = self.blocks[indices[0]].source
+            assert source.intrinsics_sigma is not None
+            yield total, source.intrinsics_sigma.of(source.query.camera) ** 2
 
 
 def _stepped(points: Array, steps: Array, centre: Array) -> Array:

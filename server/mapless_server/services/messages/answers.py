@@ -1,7 +1,6 @@
 """Messages of an answer: localization with its calibrated radii, or rejection; frames, and diagnostics."""
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mapless import wire
 from mapless.axes import Axes, covariance_to, pose_to, world_from_session_in
@@ -10,10 +9,15 @@ from mapless.geometry import Array, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
 from mapless_server.engine.query import Photo, Result
-from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance, viewpoint_gap
+from mapless_server.method.bundle.estimate import (
+    PosedSupport,
+    accuracy_from_covariance,
+    determined_intrinsics,
+    viewpoint_gap,
+)
 from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.judge.answer import Localization
-from mapless_server.method.options import IntrinsicsSource, LocalizeOptions
+from mapless_server.method.options import ChosenCamera, IntrinsicsSource, LocalizeOptions
 from mapless_server.method.rejection import PoseHypothesis, Rejection
 from mapless_server.store import SceneAttributes
 
@@ -49,30 +53,33 @@ def outcome_to_message(
     outcome = result.answer.outcome
     if isinstance(outcome, Rejection):
         rejection = result_to_rejection(result, options, frames)
-        _set_used_intrinsics(rejection, result, options, photo)
+        set_used_intrinsics(rejection, used_camera(result, options, photo))
         return pb.LocalizeResponse(rejection=rejection)
     radii = None if outcome.covariance is None else _radii_of(result, options, outcome.covariance)
     localization = _localization_to_message(outcome, radii, result.attributes, frames)
-    _set_used_intrinsics(localization, result, options, photo)
+    set_used_intrinsics(localization, used_camera(result, options, photo))
     return pb.LocalizeResponse(localization=localization)
 
 
-def _set_used_intrinsics(
-    message: pb.Localization | pb.Rejection, result: Result, options: LocalizeOptions, photo: Photo
-) -> None:
-    """Sets the intrinsics with which the pose was computed; leaves them out where none were given or found."""
+def used_camera(result: Result, options: LocalizeOptions, photo: Photo) -> ChosenCamera | None:
+    """The camera that a photograph was read with, as its matches leave it; None where none was given or found."""
     chosen, support = result.camera, result.answer.support
-    if chosen is None and photo.exif is not None:
+    if chosen is None:
+        if photo.exif is not None:
+            return None
+        chosen = ChosenCamera(photo.camera, options.intrinsics, IntrinsicsSource.GIVEN)
+    found = determined_intrinsics(support) if isinstance(support, PosedSupport) else None
+    return chosen if found is None else replace(chosen, camera=found[0], sigma=found[1])
+
+
+def set_used_intrinsics(message: pb.Localization | pb.Rejection | pb.ImageReport, camera: ChosenCamera | None) -> None:
+    """Sets the intrinsics that a photograph was read with; leaves them out where none were given or found."""
+    if camera is None:
         return
-    camera, source = (chosen.camera, chosen.source) if chosen else (photo.camera, IntrinsicsSource.GIVEN)
-    sigma = (chosen.sigma if chosen else options.intrinsics) or IntrinsicsSigma()
-    focal_share = sigma.focal_share
-    if isinstance(support, PosedSupport) and (evidence := support.estimate.intrinsics) is not None:
-        focal_share = math.sqrt(evidence.covariance[0, 0])
-        camera = support.query.photograph.camera if support.query.photograph else camera
-    message.used_intrinsics.intrinsics.CopyFrom(wire.camera_to_message(camera))
-    message.used_intrinsics.source = enum_to_message(source, pb.IntrinsicsSource)
-    message.used_intrinsics.focal_sigma_px = focal_share * camera.focal_x_px
+    sigma = camera.sigma or IntrinsicsSigma()
+    message.used_intrinsics.intrinsics.CopyFrom(wire.camera_to_message(camera.camera))
+    message.used_intrinsics.source = enum_to_message(camera.source, pb.IntrinsicsSource)
+    message.used_intrinsics.focal_sigma_px = sigma.focal_share * camera.camera.focal_x_px
 
 
 def result_to_rejection(result: Result, options: LocalizeOptions, frames: AnswerFrames) -> pb.Rejection:

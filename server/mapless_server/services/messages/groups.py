@@ -16,7 +16,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.engine.query import Query
 from mapless_server.method.bundle.estimate import accuracy_from_covariance
-from mapless_server.method.options import LocalizeOptions, Variant
+from mapless_server.method.options import ChosenCamera, IntrinsicsSource, LocalizeOptions, Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.security import key_of
 from mapless_server.store import SceneAttributes
@@ -31,6 +31,7 @@ from .answers import (
     geo_pose_to_message,
     rejection_to_message,
     result_to_rejection,
+    set_used_intrinsics,
 )
 from .queries import (
     MAX_CANDIDATES,
@@ -87,15 +88,11 @@ def queries_from_message(
                 check_capture_time(message)
             reference_ids = reference_ids_from_names(message.references, scene_id, most_references)
             narrowing, priors = priors_from_message(message, attributes)
-            if not message.HasField("intrinsics"):
-                raise FieldError(
-                    "intrinsics", "is required of rigs and sequences; a single photograph may come without"
-                )
         queries.append(
             Query(
                 scene_key=key_of(tenant, scene_id),
                 reference_ids=reference_ids,
-                photo=photo_from_message(message, path, engine.image_limits),
+                photo=photo_from_message(message, path, engine.image_limits, needs_intrinsics=False),
                 narrowing=narrowing,
                 reference_count=count,
                 options=options,
@@ -106,7 +103,23 @@ def queries_from_message(
                 attributes=attributes if needs_attributes(message) else None,
             )
         )
+    if isinstance(request, pb.LocalizeSequenceRequest):
+        _check_one_size(queries)
     return tuple(queries)
+
+
+def _check_one_size(frames: Sequence[Query]) -> None:
+    """Raises FieldError if frames without intrinsics differ in size: one camera has taken them all."""
+    sizes = {i: (it.photo.camera.width_px, it.photo.camera.height_px) for i, it in enumerate(frames) if it.photo.exif}
+    first = min(sizes, default=0)
+    for i, size in sizes.items():
+        if size != sizes[first]:
+            (width_px, height_px), (other_px, others_px) = size, sizes[first]
+            raise FieldError(
+                f"frames[{i}].intrinsics",
+                f"is required: a sequence has one camera, and of the frames without intrinsics this one has "
+                f"{width_px}x{height_px} pixels, frames[{first}] {other_px}x{others_px}",
+            )
 
 
 def _options_of(request: pb.LocalizeRigRequest | pb.LocalizeSequenceRequest, coverage: float) -> LocalizeOptions:
@@ -255,6 +268,10 @@ def _reports(
         report.diagnostics.processor_duration.FromNanoseconds(round(1e9 * group.processor_s[i]))
         if isinstance(alone.outcome, Rejection):
             report.alone.CopyFrom(result_to_rejection(result, query.options, frames[i]))
+        known = result.camera
+        if known is None and query.photo.exif is None:
+            known = ChosenCamera(query.photo.camera, None, IntrinsicsSource.GIVEN)
+        set_used_intrinsics(report, known)
         report.prior_checks.extend(message_of(it, pb.PriorCheck) for it in checks.get(i, ()))
         if i in matched:
             report.inlier_count = int(matched[i].inliers.sum())
