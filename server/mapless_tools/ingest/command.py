@@ -126,7 +126,7 @@ def import_command(
     from mapless_server.settings import ConfigError
 
     from .formats import KeyframeOptions, ReadOptions
-    from .importing import ImportOptions, run_import
+    from .importing import ImportFailed, ImportOptions, check_before_poses, run_import
     from .metres import MetreOptions
 
     try:
@@ -151,10 +151,17 @@ def import_command(
             parallel=parallel,
         )
         settings = _settings(data_dir, connection)
-        folder = _posed(folder, tag or ())
-        went_well = run_import(folder, scene, options, settings, None if dry_run else connection, report)
+        where = None if dry_run else connection
+        if _is_video(folder):
+            check_before_poses(scene, options, settings, where, report)
+            folder = _posed(folder, tag or ())
+        elif tag:
+            raise ValueError(f"--tag gives the unit of a video, and {folder} is none")
+        went_well = run_import(folder, scene, options, settings, where, report)
     except (ValueError, ConfigError) as error:
         fail(str(error))
+    except ImportFailed as error:
+        fail(str(error), code=1)
     raise typer.Exit(0 if went_well else 1)
 
 
@@ -192,14 +199,16 @@ def export_command(
     print(f"{export.written} {where}")
 
 
-def _posed(source: Path, tags: Sequence[str]) -> Path:
-    """A folder of photographs with poses, which are computed if it is a video."""
+def _is_video(source: Path) -> bool:
     from mapless_tools.reconstruct.sources.finding import VIDEOS
 
-    if not source.is_file() or source.suffix.lower() not in VIDEOS:
-        if tags:
-            raise ValueError(f"--tag gives the unit of a video, and {source} is none")
-        return source
+    return source.is_file() and source.suffix.lower() in VIDEOS
+
+
+def _posed(source: Path, tags: Sequence[str]) -> Path:
+    """The folder of a video's frames with poses, which are computed."""
+    from mapless_tools.usage import failures_end_command
+
     if package := missing_package("reconstruct"):
         raise ValueError(f"a video needs the Python package {package}: {how_to_install('reconstruct')}")
     from mapless_tools.reconstruct.folder import reconstruct_into
@@ -209,7 +218,8 @@ def _posed(source: Path, tags: Sequence[str]) -> Path:
 
     out = source.with_name(f"{source.stem}-posed")
     world = WorldOptions(tags=tuple(map(parse_sized_tag, tags)))
-    reconstruct_into([source], out, SourceOptions(excluded=(out,)), ReconstructOptions(world=world))
+    with failures_end_command(ValueError, interrupted="interrupted; run it again to go on"):
+        reconstruct_into([source], out, SourceOptions(excluded=(out,)), ReconstructOptions(world=world))
     return out
 
 

@@ -28,7 +28,7 @@ from mapless_tools.progress import Progress, progress_bars
 from .check import check_frames, check_with_scene
 from .existing import NO_METRES, KnownReferences, WrongUnit, open_scene
 from .formats import ReadOptions, read_dataset
-from .metres import MetreOptions, in_metres
+from .metres import MetreOptions, in_metres, read_positions
 from .report import (
     SAME_POSE,
     WRONG_POSES,
@@ -93,9 +93,7 @@ def run_import(
     Returns whether everything was imported, or could be. ValueError if the folder, the scene's id or the connection
     cannot be used.
     """
-    check_id(scene)
-    if report_file is not None:
-        check_writable(report_file)
+    _check_names(scene, report_file)
     dataset, frames = read_frames(folder, options)
     _print(f"{folder}: {len(dataset.frames)} frames in layout {dataset.format}, {len(frames)} of them chosen")
     for note in dataset.notes:
@@ -121,6 +119,44 @@ def run_import(
         else:
             _store(report, options, settings, connection)
     return report.went_well
+
+
+class ImportFailed(Exception):
+    """The server of an import cannot be used; the message is for a person."""
+
+
+def check_before_poses(
+    scene: str, options: ImportOptions, settings: Settings, connection: Connection | None, report_file: Path | None
+) -> None:
+    """Checks all that an import needs besides the folder, before the poses of a video are computed.
+
+    ValueError for an option, ImportFailed for the server.
+    """
+    _check_names(scene, report_file)
+    if options.format not in ("auto", "cameras"):
+        raise ValueError(f"--format is the layout of a folder of posed photographs, a video has none: {options.format}")
+    if options.split:
+        raise ValueError("--split is of folders that have splits; the frames of a video have none")
+    read = options.read
+    if read.intrinsics is not None:
+        raise ValueError("--intrinsics is of layouts without: mapless-server reconstruct --lens gives a video's")
+    for flag, path in (("--images", read.images), ("--masks", read.masks), ("--ground-truth", read.ground_truth)):
+        if path is not None:
+            raise ValueError(f"{flag} is of folders of posed photographs: import the folder that reconstruct writes")
+    if options.metres.positions is not None:
+        read_positions(options.metres.positions)
+    if connection is not None:
+        try:
+            with connected(connection, settings) as client:
+                next(client.list_scenes(), None)
+        except (MaplessError, ServerFailed) as error:
+            raise ImportFailed(str(error)) from error
+
+
+def _check_names(scene: str, report_file: Path | None) -> None:
+    check_id(scene)
+    if report_file is not None:
+        check_writable(report_file)
 
 
 def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Frame, ...]]:

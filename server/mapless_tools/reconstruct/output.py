@@ -15,7 +15,9 @@ import pycolmap
 from mapless import Reference
 from mapless import Scene as KnownScene
 from mapless.cameras import FOLDER_FILE
+from mapless.geometry import Camera
 from mapless.lenses import lens_model_of
+from mapless_server.method.features.views import MAX_INCIDENCE_DEG, undistort_pixels
 from mapless_tools.charts import figure_of, inline_svg, new_axes
 from mapless_tools.ingest.formats.writing import IMAGES, PosedImage, cameras_files
 from mapless_tools.ingest.gltf import PICTURES, View, thumbnail, to_gltf
@@ -120,7 +122,7 @@ def report(result: Reconstructed) -> str:
         facts=_facts(result),
         plan=inline_svg(figure_of(axes)),
         warnings=world.warnings,
-        notes=(*result.notes, *world.notes),
+        notes=(*result.pictures.notes, *world.notes),
         cameras=_cameras(result),
         photographs=[
             [file_name(it), str(it.point_count), ", ".join(f"{v:.3f}" for v in it.world_from_camera.translation)]
@@ -132,9 +134,16 @@ def report(result: Reconstructed) -> str:
 
 
 def summary(result: Reconstructed) -> str:
-    """One line: how many photographs have poses."""
-    count = len(result.part.posed) + sum(it.count for it in result.omitted)
-    return f"{len(result.part.posed)} of {count} photographs have poses"
+    """One line: how many photographs, and frames of videos, have poses."""
+    pictures = result.pictures
+    used = sum(it.time is not None for it in pictures.chosen)
+    posed = sum(it.picture.time is not None for it in result.part.posed)
+    texts = []
+    if pictures.photographs:
+        texts.append(f"{len(result.part.posed) - posed} of {pictures.photographs} photographs have poses")
+    if pictures.frames:
+        texts.append(f"{used} of {pictures.frames} frames were used; {posed} of them have poses")
+    return "; ".join(texts)
 
 
 def _facts(result: Reconstructed) -> dict[str, str]:
@@ -164,7 +173,7 @@ def _cameras(result: Reconstructed) -> list[list[str]]:
             continue
         camera = refined[names[0]]
         lens = "none" if camera.distortion is None else _coefficients(camera.distortion)
-        focal = f"{camera.focal_x_px:.1f} px, {_degrees(camera.width_px, camera.focal_x_px):.0f} degrees across"
+        focal = f"{camera.focal_x_px:.1f} px, {_degrees_across(camera)}"
         before = f"{start.camera.focal_x_px:.1f} px: {start.origin}"
         rows.append([str(len(names)), f"{camera.width_px} x {camera.height_px}", before, focal, lens])
     return rows
@@ -175,11 +184,18 @@ def _coefficients(lens: object) -> str:
     return f"{lens_model_of(lens)}: {values or 'all zero'}"
 
 
-def _degrees(width_px: int, focal_px: float) -> float:
-    return math.degrees(2 * math.atan(width_px / 2 / focal_px))
+def _degrees_across(camera: Camera) -> str:
+    """The angle of view from the left border to the right one, its lens undone."""
+    middle_px = camera.principal_y_px
+    borders = undistort_pixels(np.array([[-0.5, middle_px], [camera.width_px - 0.5, middle_px]]), camera)
+    if not np.isfinite(borders).all():
+        return f"more than {2 * MAX_INCIDENCE_DEG:.0f} degrees across"
+    left, right = camera.rays(borders)
+    return f"{math.degrees(math.atan2(right[0], 1) - math.atan2(left[0], 1)):.0f} degrees across"
 
 
 def printed(result: Reconstructed) -> Sequence[str]:
     """Lines for a terminal."""
     lines = [summary(result), *(f"{name}: {value}" for name, value in _facts(result).items())]
-    return [*lines, *(f"warning: {it}" for it in result.world.warnings)]
+    notes = [f"note: {it}" for it in (*result.pictures.notes, *result.world.notes)]
+    return [*lines, *notes, *(f"warning: {it}" for it in result.world.warnings)]

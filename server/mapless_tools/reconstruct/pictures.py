@@ -52,11 +52,16 @@ class Omitted:
 
 @dataclass(frozen=True)
 class Pictures:
-    """The photographs that take part, in the order in which they were taken, and those that do not."""
+    """The photographs that take part, in the order in which they were taken, and those that do not.
+
+    `photographs` and `frames` are the numbers of photographs, and of frames of videos, that the sources have.
+    """
 
     chosen: tuple[Picture, ...]
     omitted: tuple[Omitted, ...] = ()
     notes: tuple[str, ...] = ()
+    photographs: int = 0
+    frames: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,10 +29,9 @@ from .features import FeatureFolder
 from .mapping import FEWEST, map_photographs, omitted, read_parts, why_no_part
 from .matching import MatchFolder, PairOptions, pairs_of, verify, write_database
 from .pictures import Omitted, Part, Picture, Pictures, WorldFrame
+from .sources.finding import WORK
 from .world.options import WorldOptions
 from .world.placing import place
-
-WORK = ".work"
 
 
 @dataclass(frozen=True)
@@ -65,12 +64,12 @@ class Reconstructed:
     `parts` are the numbers of photographs of all parts; `omitted` are those without a pose in this one.
     """
 
+    pictures: Pictures
     part: Part
     world: WorldFrame
     cameras: tuple[StartingCamera, ...]
     parts: tuple[int, ...]
     omitted: tuple[Omitted, ...]
-    notes: tuple[str, ...]
 
 
 def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, progress: Progress) -> Reconstructed:
@@ -96,7 +95,7 @@ def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, pro
     part = parts[options.part - 1]
     left_out = (*pictures.omitted, *omitted(part, parts, chosen, attempt.database))
     placed, world = place(part, options.world, progress)
-    return Reconstructed(placed, world, cameras, tuple(len(it.posed) for it in parts), left_out, pictures.notes)
+    return Reconstructed(pictures, placed, world, cameras, tuple(len(it.posed) for it in parts), left_out)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """Photographs without poses get the poses that are known of them, or a sentence that says why not."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +23,10 @@ from mapless_tools.ingest.metres import umeyama
 from mapless_tools.progress import Progress
 from mapless_tools.reconstruct.cameras import LensOptions, starting_cameras
 from mapless_tools.reconstruct.features import FeatureFolder
+from mapless_tools.reconstruct.folder import locked
 from mapless_tools.reconstruct.matching import PairOptions, pairs_of
-from mapless_tools.reconstruct.output import write_folder
-from mapless_tools.reconstruct.pictures import Picture, VideoTime
+from mapless_tools.reconstruct.output import summary, write_folder
+from mapless_tools.reconstruct.pictures import Picture, Pictures, VideoTime
 from mapless_tools.reconstruct.run import (
     Reconstructed,
     ReconstructOptions,
@@ -199,6 +201,83 @@ def test_folder_of_others_is_not_written_to(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not empty"):
         prepare([tmp_path], tmp_path)
     assert [it.name for it in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_second_run_on_one_folder_is_refused(tmp_path: Path) -> None:
+    with (
+        locked(tmp_path, tmp_path),
+        pytest.raises(ValueError, match=rf"another run \(process {os.getpid()}\)"),
+        locked(tmp_path, tmp_path),
+    ):
+        pass
+    with locked(tmp_path, tmp_path):
+        pass
+
+
+def test_poses_beside_photographs_are_named(
+    result: Reconstructed, tmp_path: Path, chosen: Sequence[Photograph]
+) -> None:
+    out = tmp_path / "posed"
+    work = prepare([tmp_path], out)
+    write_folder(result, work, out, silent)
+    again = read_sources([out / "images"], tmp_path / "pictures", SourceOptions(), silent)
+    assert f"has poses of {len(chosen)} of the photographs already" in again.notes[0]
+    (out / "cameras.json").write_text("[]")
+    foreign = read_sources([out], tmp_path / "pictures", SourceOptions(), silent)
+    assert "cameras.json is not used: " in foreign.notes[0]
+    with pytest.raises(ValueError, match="there is no photograph"):
+        read_sources([tmp_path], tmp_path / "pictures", SourceOptions(), silent)
+
+
+def test_frames_and_photographs_are_counted_apart(result: Reconstructed) -> None:
+    assert summary(result) == "7 of 7 photographs have poses"
+    chosen = tuple(replace(it, time=VideoTime("a.mp4", i, 0.1 * i)) for i, it in enumerate(result.pictures.chosen))
+    posed = tuple(replace(it, picture=frame) for it, frame in zip(result.part.posed[:5], chosen, strict=False))
+    video = Pictures(chosen, frames=600)
+    of_video = replace(result, pictures=video, part=replace(result.part, posed=posed))
+    assert summary(of_video) == "7 of 600 frames were used; 5 of them have poses"
+
+
+@pytest.mark.parametrize(
+    ("flag", "content", "message"),
+    [
+        ("--positions", None, "cannot be read"),
+        ("--positions", "a,1,2\n", "line 1"),
+        ("--positions", "a,1,2,3\nb,1,2,3\nc,1,2,4\n", "0 of its names"),
+        ("--gravity", "a,0,0,0\n", "the direction of a is zero"),
+        ("--lens", "{}", "lens.json"),
+        ("--distance", None, "there is no photograph 'a'"),
+    ],
+)
+def test_wrong_files_are_named_before_computing(
+    flag: str, content: str | None, message: str, source: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / ("lens.json" if flag == "--lens" else "known.csv")
+    if content:
+        file.write_text(content)
+    values = ["a", "b", "1"] if flag == "--distance" else [str(file)]
+    done = CliRunner().invoke(app, ["reconstruct", str(source), str(tmp_path / "out"), flag, *values])
+    assert done.exit_code == 2
+    assert message in plain(done.output)
+    assert not (tmp_path / "out" / ".work" / "features").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("no id",), "an id is"),
+        (("hall", "--report", "no/folder/report.json"), "cannot be written"),
+        (("hall", "--format", "colmap"), "a video has none"),
+        (("hall", "--align", "none.csv"), "none.csv"),
+        (("hall", "--address", "127.0.0.1:1"), "127.0.0.1:1"),
+    ],
+)
+def test_import_of_a_video_checks_flags_first(tmp_path: Path, arguments: Sequence[str], message: str) -> None:
+    (tmp_path / "walk.mp4").write_bytes(b"")
+    done = CliRunner().invoke(app, ["import", str(tmp_path / "walk.mp4"), *arguments])
+    assert done.exit_code in (1, 2)
+    assert message in plain(done.output)
+    assert not (tmp_path / "walk-posed").exists()
 
 
 def test_import_of_a_video_of_two_frames_says_what_is_needed(tmp_path: Path) -> None:

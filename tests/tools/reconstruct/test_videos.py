@@ -2,7 +2,9 @@
 
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from mapless_server.images import ANY_SIZE, decode_image
 from mapless_tools.reconstruct.pictures import Picture, Pictures
 from mapless_tools.reconstruct.sources import SourceOptions, read_sources
 from mapless_tools.reconstruct.sources.choosing import choose_frames, common_spacing
+from mapless_tools.reconstruct.sources.video import Video, opened_video
 
 av = pytest.importorskip("av")
 
@@ -50,6 +53,7 @@ def write(file: Path, frames: Sequence[NDArray[Any]], times_ms: Sequence[int] | 
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt = options.get("pix_fmt", "yuv420p")
         stream.codec_context.gop_size = options.get("gop", 30)
+        stream.codec_context.thread_count = 1  # several give another video each time
         stream.codec_context.time_base = Fraction(1, 1000)
         if "aspect" in options:
             stream.codec_context.sample_aspect_ratio = options["aspect"]
@@ -121,6 +125,35 @@ def test_blurred_frames_are_not_chosen(tmp_path: Path) -> None:
     chosen = indices(read(write(tmp_path / "a.mp4", frames)))
     assert len(chosen) > 10
     assert not blurred.intersection(chosen[1:])
+
+
+def test_video_that_cannot_be_sought_in_gives_the_same_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Unseekable:
+        """A container whose seek fails."""
+
+        def __init__(self, container: Any) -> None:
+            self._container = container
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(self._container, name)
+
+        def seek(self, *_: object, **__: object) -> None:
+            raise av.error.PermissionError(1, "Operation not permitted")
+
+    @contextmanager
+    def unseekable(file: Path, *, keys_only: bool = False) -> Iterator[Video]:
+        with opened_video(file, keys_only=keys_only) as video:
+            container: Any = Unseekable(video.container)
+            yield replace(video, container=container)
+
+    file = write(tmp_path / "a.mp4", pan(np.arange(60) * 10.0), gop=2)
+    sought = read(file)
+    monkeypatch.setattr("mapless_tools.reconstruct.sources.frames.opened_video", unseekable)
+    (tmp_path / "other").mkdir()
+    counted = read(file.rename(tmp_path / "other" / "a.mp4"))
+    assert indices(counted) == indices(sought)
+    for one, other in zip(counted.chosen, sought.chosen, strict=True):
+        assert one.path.read_bytes() == other.path.read_bytes()
 
 
 def test_still_camera_gives_one_frame(tmp_path: Path) -> None:

@@ -24,7 +24,10 @@ def recognize(path: Path) -> str:
     _check_there(path)
     found = [name for name in FORMATS if fits(path, name)]
     if not found:
-        raise ValueError(f"{path} has no layout that is known ({', '.join(FORMATS)}); name one with --format")
+        raise ValueError(
+            f"{path} has no layout that is known ({', '.join(FORMATS)}); name one with --format; the poses of "
+            "photographs without any are computed by `mapless-server reconstruct`"
+        )
     if len(found) > 1:
         raise ValueError(f"{path} has several layouts: {', '.join(found)}; name one with --format")
     return found[0]

@@ -18,7 +18,8 @@ what they show have common points with three or more of their neighbours."""
 _MOTION = 0.08
 """Share of the diagonal; this much median motion makes another view, even if all is still seen, as when walking
 forward."""
-_BLURRED = 0.5
+_BLURRED, _SHARP_PERCENT = 0.5, 75
+"""A frame is blurred if it is half as sharp as the sharper quarter of those before it, of which half may be blurred."""
 _RECENT = 15
 _MAX_WAIT = 15
 """Frames that may be blurred or show nothing before they count."""
@@ -77,7 +78,7 @@ class Content:
             self._loss = position
         self._share = seen.share
         progress = max((1 - seen.share) / _LOST_SHARE, seen.motion / _MOTION)
-        is_blurred = sharpness < _BLURRED * float(np.median(self._recent))
+        is_blurred = sharpness < _BLURRED * float(np.percentile(self._recent, _SHARP_PERCENT))
         if is_blurred and self._waited < _MAX_WAIT:
             self._waited += 1
         elif progress < 1:

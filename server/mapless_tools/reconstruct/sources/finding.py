@@ -21,6 +21,8 @@ UNREAD = (
     *(".dng", ".raw", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".rw2", ".raf", ".srw", ".pef", ".3fr"),
 )
 """Endings of images that are not read; RAW among them, whose pixels depend on the program that develops them."""
+WORK = ".work"
+"""Name of the folder, in that of the output, which has the results of the steps."""
 _HIDDEN = ("__MACOSX", "@eaDir")
 """Beside names that begin with a dot: folders of small copies that archives and network drives make."""
 _HEAD = 32
@@ -93,7 +95,10 @@ def _files_of(source: Path, options: SourceOptions) -> Iterable[SourceFile]:
 
 
 def _walk(source: Path, excluded: set[Path]) -> Iterator[Path]:
-    """Yields the files below a folder, but those of excluded and hidden ones; a link to a folder above ends there."""
+    """Yields the files below a folder, but those of hidden and excluded ones, and of results of reconstructions.
+
+    A link to a folder above ends there.
+    """
 
     def fail(error: OSError) -> None:
         raise ValueError(f"{printable(str(error.filename))} cannot be read: {error.strerror}") from error
@@ -104,7 +109,8 @@ def _walk(source: Path, excluded: set[Path]) -> Iterator[Path]:
         kept = []
         for name in inner:
             resolved = (here / name).resolve()
-            if not _is_hidden(name) and resolved not in excluded and resolved not in entered:
+            left_out = _is_hidden(name) or is_result(here / name) or resolved in excluded
+            if not left_out and resolved not in entered:
                 entered.add(resolved)
                 kept.append(name)
         inner[:] = kept
@@ -114,6 +120,11 @@ def _walk(source: Path, excluded: set[Path]) -> Iterator[Path]:
 def _is_special(file: Path) -> bool:
     """Whether a file is a pipe, a socket or a device: reading it may never end."""
     return file.exists() and not file.is_file()
+
+
+def is_result(folder: Path) -> bool:
+    """Whether a folder is the output of a reconstruction, whose photographs are those of its sources."""
+    return (folder / WORK).is_dir()
 
 
 def _is_hidden(name: str) -> bool:

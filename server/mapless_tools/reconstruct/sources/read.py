@@ -11,6 +11,7 @@ from .finding import find_files
 from .looking import Looked
 from .options import SourceOptions
 from .photographs import read_photographs
+from .posed import notes_of_poses
 from .remembered import Remembered
 from .videos import ChosenFrame, read_videos
 
@@ -33,12 +34,13 @@ def read_sources(sources: Sequence[Path], folder: Path, options: SourceOptions, 
     _make_folder(folder)
     remembered = Remembered(folder / _LOG)
     photographs, omitted, notes = read_photographs(files.photographs, folder, options, remembered, progress)
-    frames, unused, said = read_videos(files.videos, files.photographs, folder, options, remembered, progress)
+    frames, unused, said, count = read_videos(files.videos, files.photographs, folder, options, remembered, progress)
     omitted = [*files.omitted, *omitted, *unused]
     chosen = _named(photographs, frames)
     if not chosen:
         raise ValueError(_nothing(sources, omitted))
-    return Pictures(tuple(chosen), tuple(omitted), (*notes, *said))
+    posed = notes_of_poses(sources, [it.path for it in files.photographs])
+    return Pictures(tuple(chosen), tuple(omitted), (*posed, *notes, *said), len(files.photographs), count)
 
 
 def _excluding(options: SourceOptions, folder: Path) -> SourceOptions:

@@ -43,8 +43,11 @@ def read_videos(
     options: SourceOptions,
     remembered: Remembered,
     progress: Progress,
-) -> tuple[list[ChosenFrame], list[Omitted], list[str]]:
-    """The frames that take part, in the order of the videos and of time, what does not, and notes."""
+) -> tuple[list[ChosenFrame], list[Omitted], list[str], int]:
+    """The frames that take part, in the order of the videos and of time, what does not, notes, and how many there are.
+
+    ValueError if there are more videos than frames may be chosen.
+    """
     watched: list[tuple[SourceFile, Watched]] = []
     omitted: list[Omitted] = []
     beside = {(it.path.parent, it.path.stem.casefold()) for it in photographs}
@@ -66,7 +69,7 @@ def read_videos(
         if rest:
             omitted.append(Omitted(file.name, "what they show, chosen frames show too, or they are less sharp", rest))
         notes += [f"{file.name}: {note}" for note in (_choice(it, frames, spacing), *it.notes)]
-    return chosen, omitted, notes
+    return chosen, omitted, notes, sum(it.count for _, it in watched)
 
 
 def _watched(

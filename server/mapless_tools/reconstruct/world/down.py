@@ -54,16 +54,21 @@ def upright_axes(posed: PosedPicture) -> RigidTransform:
     return RigidTransform(pose.rotation @ turned, pose.translation)
 
 
+def known_directions(file: Path) -> dict[str, Array]:
+    """Unit vectors (3,) by name of a CSV file (name, x, y, z); ValueError if it cannot be read or a vector is zero."""
+    vectors = read_positions(file)
+    for name, vector in vectors.items():
+        if not np.linalg.norm(vector) > 0:
+            raise ValueError(f"{file}: the direction of {name} is zero")
+    return {name: vector / np.linalg.norm(vector) for name, vector in vectors.items()}
+
+
 def down_of_gravity(file: Path, part: Part, find: Finder) -> Down:
     """The mean of the directions that a CSV file has in cameras' axes; ValueError if most of them do not agree."""
     poses = {it.picture.name: it.world_from_camera for it in part.posed}
-    known = {name: vector for name, vector in read_positions(file).items() if name in find}
-    if not known:
+    units = {name: vector for name, vector in known_directions(file).items() if name in find}
+    if not units:
         raise ValueError(f"{file}: none of its names is that of a photograph of this part")
-    for name, vector in known.items():
-        if not np.linalg.norm(vector) > 0:
-            raise ValueError(f"{file}: the direction of {name} is zero")
-    units = {name: vector / np.linalg.norm(vector) for name, vector in known.items()}
     directions = np.array([poses[find(name).name].rotation @ vector for name, vector in units.items()])
     angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1, 1)))
     fits = angles[np.median(angles, axis=1).argmin()] <= GRAVITY_BOUND_DEG

@@ -16,6 +16,8 @@ from .options import AXES
 UP_OF_FORMATS = {"arkit": "y"}
 """Axis that points up in the layouts whose world is aligned with gravity."""
 POSITIONS_BOUND_DEG = 10.0
+MIN_POSITIONS = 3
+"""Positions, not on one line, that determine a similarity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ def read_known_positions(source: Path, up: str, find: Finder) -> KnownPositions:
 
     ValueError if they are too few, on one line, or contradict the poses.
     """
-    known, own_down = _positions(source)
+    known, own_down = known_positions(source)
     within = {name: position for name, position in known.items() if name in find}
     if not within:
         some = ", ".join(sorted(known)[:3])
@@ -58,8 +60,11 @@ def read_known_positions(source: Path, up: str, find: Finder) -> KnownPositions:
     return KnownPositions(source.name, fit, middle_m, middle_units, down, tuple(notes))
 
 
-def _positions(source: Path) -> tuple[dict[str, Array], Array | None]:
-    """Positions by name, metres, and the way down in their frame, None if it is not known."""
+def known_positions(source: Path) -> tuple[dict[str, Array], Array | None]:
+    """Positions by name, metres, and the way down in their frame, None if it is not known.
+
+    ValueError if the source cannot be read, or is not in metres.
+    """
     if not source.is_dir():
         return read_positions(source), None
     dataset = read_dataset(source)
