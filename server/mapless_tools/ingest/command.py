@@ -206,7 +206,7 @@ def _is_video(source: Path) -> bool:
 
 
 def _posed(source: Path, tags: Sequence[str]) -> Path:
-    """The folder of a video's frames with poses, which are computed."""
+    """The folder of a video's frames with poses, which are computed; here, for a video's own may not be written to."""
     from mapless_tools.usage import failures_end_command
 
     if package := missing_package("reconstruct"):
@@ -216,7 +216,7 @@ def _posed(source: Path, tags: Sequence[str]) -> Path:
     from mapless_tools.reconstruct.sources import SourceOptions
     from mapless_tools.reconstruct.world.options import WorldOptions, parse_sized_tag
 
-    out = source.with_name(f"{source.stem}-posed")
+    out = Path(f"{source.stem}-posed")
     world = WorldOptions(tags=tuple(map(parse_sized_tag, tags)))
     with failures_end_command(ValueError, interrupted="interrupted; run it again to go on"):
         reconstruct_into([source], out, SourceOptions(excluded=(out,)), ReconstructOptions(world=world))

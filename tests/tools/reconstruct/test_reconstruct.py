@@ -272,7 +272,10 @@ def test_wrong_files_are_named_before_computing(
         (("hall", "--address", "127.0.0.1:1"), "127.0.0.1:1"),
     ],
 )
-def test_import_of_a_video_checks_flags_first(tmp_path: Path, arguments: Sequence[str], message: str) -> None:
+def test_import_of_a_video_checks_flags_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: Sequence[str], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "walk.mp4").write_bytes(b"")
     done = CliRunner().invoke(app, ["import", str(tmp_path / "walk.mp4"), *arguments])
     assert done.exit_code in (1, 2)
@@ -280,8 +283,9 @@ def test_import_of_a_video_checks_flags_first(tmp_path: Path, arguments: Sequenc
     assert not (tmp_path / "walk-posed").exists()
 
 
-def test_import_of_a_video_of_two_frames_says_what_is_needed(tmp_path: Path) -> None:
+def test_import_of_a_video_of_two_frames_says_what_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     av = pytest.importorskip("av")
+    monkeypatch.chdir(tmp_path)
     file = tmp_path / "walk.mp4"
     with av.open(str(file), "w") as container:
         stream = container.add_stream("mpeg4", rate=2)
