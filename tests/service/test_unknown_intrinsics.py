@@ -114,6 +114,15 @@ def test_other_places_and_small_images_are_rejected(client: Client) -> None:
         assert isinstance(client.localize(image, scene="corner"), Rejected)
 
 
+def test_one_reference_needs_a_known_focal_length(client: Client) -> None:
+    answer = client.localize(photograph(THERE), scene="corner", references=["r2"])
+    assert isinstance(answer, Rejected)
+    assert answer.reason == "NO_USABLE_REFERENCES"
+    assert "no focal length" in answer.message
+    assert answer.hint is not None
+    assert answer.hint.advice == "CHECK_CALIBRATION"
+
+
 def test_an_uncertainty_is_that_of_intrinsics(client: Client) -> None:
     with pytest.raises(InvalidArgument) as raised:
         client.localize(photograph(THERE), scene="corner", intrinsics_uncertainty=IntrinsicsUncertainty(3.0))

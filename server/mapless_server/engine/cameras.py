@@ -13,7 +13,7 @@ from mapless_server.method.bundle.intrinsics import read_as
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.options import ChosenCamera, IntrinsicsSource
 from mapless_server.method.pipeline import Prepared
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.unknown_camera import UNKNOWN, camera_of_references, choose_camera
 
 from .query import Photo
@@ -74,7 +74,12 @@ def _seen(view: View, query_matches: Sequence[Matches]) -> tuple[View, tuple[Mat
 
 def _unknown(reference_count: int) -> Rejection:
     if reference_count < 2:
-        message = "the photograph's focal length is not known: it is found by two references or more"
-        return Rejection(RejectionReason.NO_USABLE_REFERENCES, message)
+        message = (
+            "the photograph has no intrinsics, its EXIF has no focal length, and it is compared with one reference: "
+            "two are needed to find it"
+        )
+        advice = "Send the photograph's intrinsics, or the file with its EXIF; or use two references or more."
+        hint = Hint(CAMERA, Advice.CHECK_CALIBRATION, advice)
+        return Rejection(RejectionReason.NO_USABLE_REFERENCES, message, hint)
     message = "no pose of a camera of any focal length explains the matches with the references"
     return Rejection(RejectionReason.LOW_OVERLAP, message)

@@ -12,9 +12,11 @@ pose and focal length together minimize
 with the guess's standard deviation sigma. A camera of references is improved no further than their focal lengths differ
 among each other, unless this differs from it by more than chance: then it is another one.
 
-From then on everything is as for intrinsics that were given with this standard deviation: the adjustment finds how much
-the matches determine, and of a flat wall that is little. That the references' camera fits makes the pose more accurate,
-but no more certain: another camera may have the same sides, and a focal length that the photograph does not tell apart.
+The adjustment improves it, with principal point and radial distortion, each within its prior, together with the pose:
+principal points are off the centre by up to 1.4 % of the width, and the matches show what a wrong one does to a pose.
+It finds, too, how much they determine: of a flat wall that is little. That the references' camera fits makes the pose
+more accurate, but no more certain: another camera may have the same sides, and a focal length that the photograph does
+not tell apart.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,36 +33,26 @@ from .bundle.pose_problem import AdjustOptions
 from .bundle.priors import IntrinsicsSigma
 from .features.limits import INEXACT_INLIER_PX
 from .features.views import PosedView, View
-from .judge.cameras import BY_POINTS, LINES, PNP
+from .judge.cameras import BY_POINTS, LINES, PNP, ScoredCamera
 from .optim.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize, perturbed, pose_jacobian
 from .options import ChosenCamera, IntrinsicsSource
 from .pairs.correspond import Correspondences
 from .pose.pnp import MIN_MATCHES, ransac
-from .pose.relative import Evidence, find_pose, scores_by_keypoint
+from .pose.relative import Evidence, find_pose
 from .pose.two_view_matches import TwoViewMatches
 from .significance import is_significant, sigmas_of_gains
 from .structure.match import vote
 from .structure.structure import StructureOptions, triangulated_structure
 
-UNKNOWN = IntrinsicsSigma(0.3, 0.01, 0.05)
+UNKNOWN = IntrinsicsSigma(0.3, 0.01, 0.05, is_guess=True)
 """Standard deviations of a camera of which nothing is known: focal lengths of most cameras are within a third of one
 another, principal points within 2 % of the width of the centre, and lenses that are not corrected bend the edge by some
 per cent. Evidence: unknown-camera."""
 
+OF_REFERENCES = replace(UNKNOWN, is_guess=False)
+"""The same for the camera of references that fits: it is as accurate as theirs, but nothing else speaks for it."""
+
 STEPS = MinimizeOptions(AdjustOptions.iterations, AdjustOptions.min_decrease)
-
-
-@dataclass(frozen=True, eq=False)
-class _Scored:
-    """A camera with the best pose that was found, None if none was, and its scores (F,) by keypoint."""
-
-    guess: ChosenCamera
-    pose: RigidTransform | None
-    scores: Array
-
-    @property
-    def total(self) -> float:
-        return float(self.scores.sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,15 +81,14 @@ class _Matches:
             view, self.references, lines[seen[lines.keypoint]], self.x_in_world[points], self.keypoint[points]
         )
 
-    def scored(self, guess: ChosenCamera) -> _Scored:
+    def scored(self, camera: Camera) -> ScoredCamera:
         """A camera with the best pose that a brief search finds."""
-        evidence, pose = self.evidence(guess.camera), None
+        evidence, pose = self.evidence(camera), None
         if len(self.x_in_world) < LEAST_MATCHES:
             pose = find_pose(evidence, LINES)
         elif len(evidence.x_in_world) >= MIN_MATCHES:  # through a strong lens few may be seen
             pose = ransac(evidence.points, None, PNP)
-        none = np.zeros(len(self.view.features))
-        return _Scored(guess, pose, none if pose is None else scores_by_keypoint(evidence, pose))
+        return ScoredCamera.of(camera, evidence, pose)
 
 
 def choose_camera(
@@ -114,25 +105,27 @@ def choose_camera(
     if len(references) < 2:
         return guesses[0] if guesses else None
     matches = _Matches.of(view, references, correspondences)
-    known = [matches.scored(it) for it in (*guesses, *_of_references(view, references))]
-    options = [*known, *map(matches.scored, _series(view.camera))]
-    best = max(options, key=lambda it: it.total)
+    options = [*guesses, *_of_references(view, references), *_series(view.camera)]
+    scored = [matches.scored(it.camera) for it in options]
+    best = max(scored, key=lambda it: it.total)
     if best.pose is None:
         return None
-    found = next(it for it in options if not is_significant(sigmas_of_gains(best.scores - it.scores), len(options)))
-    log_ratio, sigma = _improved(matches, found)
-    if found.guess.source is not IntrinsicsSource.SCENE_CAMERA:
-        return replace(found.guess, camera=scaled(found.guess.camera, log_ratio))
+    is_as_good = [not is_significant(sigmas_of_gains(best.scores - it.scores), len(options)) for it in scored]
+    chosen, found = options[is_as_good.index(True)], scored[is_as_good.index(True)]
+    prior = (chosen.sigma or IntrinsicsSigma()).focal_share
+    log_ratio, sigma = _improved(matches, found, prior)
+    if chosen.source is not IntrinsicsSource.SCENE_CAMERA:
+        return replace(chosen, camera=scaled(chosen.camera, log_ratio))
     if abs(log_ratio) >= DOUBTED_SIGMAS * sigma:  # then it is another camera
-        estimated = scaled(found.guess.camera, log_ratio)
+        estimated = scaled(chosen.camera, log_ratio)
         return ChosenCamera(estimated, UNKNOWN, IntrinsicsSource.ESTIMATED)
     spread = float(np.std([np.log(it.focal_x_px) for it in _cameras_of(view.camera, references)]))
-    return replace(found.guess, camera=scaled(found.guess.camera, log_ratio * spread**2 / (spread**2 + sigma**2)))
+    return replace(chosen, camera=scaled(chosen.camera, log_ratio * spread**2 / (spread**2 + sigma**2)))
 
 
 def _of_references(view: View, references: Sequence[PosedView]) -> Sequence[ChosenCamera]:
     camera = camera_of_references(view.camera, references)
-    return [replace(camera, sigma=UNKNOWN)] if camera else ()
+    return [replace(camera, sigma=OF_REFERENCES)] if camera else ()
 
 
 def camera_of_references(raster: Camera, references: Sequence[PosedView]) -> ChosenCamera | None:
@@ -145,7 +138,7 @@ def camera_of_references(raster: Camera, references: Sequence[PosedView]) -> Cho
     if not cameras:
         return None
     is_one = cameras[-1].focal_x_px <= (1 + 2 * usual) * cameras[0].focal_x_px
-    return ChosenCamera(cameras[len(cameras) // 2], None if is_one else UNKNOWN, IntrinsicsSource.SCENE_CAMERA)
+    return ChosenCamera(cameras[len(cameras) // 2], None if is_one else OF_REFERENCES, IntrinsicsSource.SCENE_CAMERA)
 
 
 def _cameras_of(raster: Camera, references: Sequence[PosedView]) -> list[Camera]:
@@ -166,12 +159,12 @@ def _series(camera: Camera) -> Iterator[ChosenCamera]:
         yield ChosenCamera(centred, UNKNOWN, IntrinsicsSource.ESTIMATED)
 
 
-def _improved(matches: _Matches, found: _Scored) -> tuple[float, float]:
+def _improved(matches: _Matches, found: ScoredCamera, prior: float) -> tuple[float, float]:
     """The most probable logarithm of the ratio of the focal length to that of the camera, by the points near its pose.
 
-    Also its standard deviation; 0 and infinity where the points are too few.
+    Also its standard deviation; 0 and infinity where the points are too few. `prior` is that without the photograph.
     """
-    camera, prior, pose = found.guess.camera, (found.guess.sigma or IntrinsicsSigma()).focal_share, found.pose
+    camera, pose = found.camera, found.pose
     log_ratio, sigma = 0.0, np.inf
     for _ in range(2):  # which points are near at a pose of a camera that is a step off
         if pose is None:

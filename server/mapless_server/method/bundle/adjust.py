@@ -12,6 +12,7 @@ The query's intrinsics stay as given: where they are right, poses are more accur
 the photograph says of their errors follows from the same normal equations, and the pose's covariance contains them (see
 `intrinsics`). Parameters that the photograph contradicts are estimated with the pose: first all together, which shows
 the wrong ones; then these alone, the most significant one first. The photograph is read again with each value.
+Intrinsics that are a guess, of a photograph that came without, are estimated with the pose, all within their prior.
 
 Priors on the query's pose add their terms, unless the photograph alone contradicts them.
 """
@@ -54,6 +55,8 @@ LINEAR_CHANGE = np.array([0.01, 0.01, 0.01, 0.02])
 """Changes, in the units of `WIDE_SIGMA`, below which keypoints move in proportion to them, to a tenth of a pixel."""
 LEAST_MATCHES = 20
 """Fewer do not determine a pose and intrinsics, nor decide between cameras."""
+GUESS_INFLATION = 1.5
+"""Factor on standard deviations of intrinsics that are estimated with the pose. Evidence: unknown-camera."""
 ROUGHLY = 2.0
 """Factor on `AdjustOptions.min_motion_sigma` before the photograph is read again."""
 
@@ -65,7 +68,12 @@ def recalibrated(solved: Solved, found: PoseEstimate, priors: Priors, terms: Int
     """
     given, query, options, usual = solved.given, solved.given.query, solved.given.options, terms.prior_sigma
     held, untried = usual, np.ones(4, bool)
+    if _are_guessed(given):
+        if (estimated := _with_errors(given, found, priors, terms, solved)) is not None:
+            return _inflated(estimated)
+        untried[:3] = False  # a guess of these has the widest prior already: only a lens may be beyond it
     wide = np.maximum(usual, WIDE_SIGMA * np.array([1, query.camera.width_px, query.camera.width_px, 1]))
+    wide = np.where(untried, wide, usual)
     if not is_suspicious(found, options):
         return found
     # With all estimated, the wrong ones stand out: an error that is held looks like errors of the others.
@@ -82,6 +90,18 @@ def recalibrated(solved: Solved, found: PoseEstimate, priors: Priors, terms: Int
         elif better.intrinsics.contradicted(options.suspicion)[list(worst)].any():
             found = _doubted(found, better.intrinsics, worst, shares_camera(query, given.references))
     return found
+
+
+def _are_guessed(given: AdjustInput) -> bool:
+    return given.intrinsics is not None and given.intrinsics.is_guess
+
+
+def _inflated(found: PoseEstimate) -> PoseEstimate:
+    """The estimate with larger standard deviations of the intrinsics that were estimated with it."""
+    assert found.intrinsics is not None
+    evidence, factor = found.intrinsics, GUESS_INFLATION**2
+    covariance = found.covariance + (factor - 1) * evidence.pose_covariance
+    return replace(found, covariance=covariance, intrinsics=replace(evidence, covariance=factor * evidence.covariance))
 
 
 def is_suspicious(found: PoseEstimate, options: AdjustOptions) -> bool:
@@ -216,7 +236,7 @@ def _adjusted(given: AdjustInput, estimate: PoseEstimate, priors: Priors) -> tup
     """
     terms = intrinsics_terms(given)
     own = _own_tracks(given, estimate)
-    is_agreeing = estimate.inliers.mean() >= given.options.agreeing_share
+    is_agreeing = estimate.inliers.mean() >= given.options.agreeing_share and not _are_guessed(given)
     first = _at_optimum(given, estimate, priors, terms, own) if own and is_agreeing else None
     if first and not is_suspicious(first[0], given.options):
         return _sharpened(first[0], priors), first[1]

@@ -59,11 +59,13 @@ class IntrinsicsSigma:
             with focus and temperature, and calibrations are not more repeatable.
         principal_share: standard deviation of each coordinate of the principal point, as a share of the image's width.
         k1: standard deviation of the first radial coefficient.
+        is_guess: whether the intrinsics are a guess, which the adjustment improves with the pose, and no calibration.
     """
 
     focal_share: float = 0.003
     principal_share: float = 0.003
     k1: float = 0.01
+    is_guess: bool = False
 
     def __post_init__(self) -> None:
         check_bounds(self, "focal_share principal_share k1", above=0, at_most=1)

@@ -160,6 +160,26 @@ BY_POINTS, BY_LINES = _Steps(5, 4, 3, 0.08), _Steps(2, 2, 1, 0.16)
 
 
 @dataclass(frozen=True, eq=False)
+class ScoredCamera:
+    """A camera with the best pose that was found, None if none was, and its scores (F,) by keypoint."""
+
+    camera: Camera
+    pose: RigidTransform | None
+    scores: Array
+
+    @staticmethod
+    def of(camera: Camera, matches: Evidence, pose: RigidTransform | None) -> "ScoredCamera":
+        """The camera with the scores of a pose by the matches of the photograph as read with it."""
+        none = np.zeros(len(matches.query.features))
+        return ScoredCamera(camera, pose, none if pose is None else scores_by_keypoint(matches, pose))
+
+    @property
+    def total(self) -> float:
+        """Sum of the scores."""
+        return float(self.scores.sum())
+
+
+@dataclass(frozen=True, eq=False)
 class _Compared:
     """The matches that cameras are compared by: those of the whole image with points, and those with references.
 
@@ -187,19 +207,19 @@ class _Compared:
         """A view of the photograph with every `step`-th keypoint."""
         return replace(view, features=view.features.every(self.step))
 
-    def own(self, given: Camera) -> "_Scored":
+    def own(self, given: Camera) -> ScoredCamera:
         """The given camera with its best pose: the estimate, or another one."""
-        found = list[_Scored]()
+        found = list[ScoredCamera]()
         if isinstance(self.support, PosedSupport):
             estimate = self.support.estimate
             # The estimate's own intrinsics are those that were estimated with it, within what the caller allows.
             view = self.thinned(estimate.view or self.support.query)
-            found.append(self._scored(given, self.matches_of(view), estimate.world_from_camera))
+            found.append(ScoredCamera.of(given, self.matches_of(view), estimate.world_from_camera))
         if not self.by_lines:
             found.append(self.scored(given))
         return max(found, key=lambda it: it.total)
 
-    def scored(self, camera: Camera) -> "_Scored":
+    def scored(self, camera: Camera) -> ScoredCamera:
         """A camera with the best pose that a brief search finds, comparable with that of the given camera."""
         matches = self.matches_of(self.read_as(camera))
         pose = None
@@ -207,12 +227,12 @@ class _Compared:
             pose = find_pose(matches, LINES)
         elif len(matches.x_in_world) >= pnp.MIN_MATCHES:  # through a strong lens few may be seen
             pose = ransac(matches.points, None, PNP)
-        found = self._scored(camera, matches, pose)
+        found = ScoredCamera.of(camera, matches, pose)
         # Without points a wrong lens can reach the right camera's score more nearly than a wrong focal length.
         is_bent = self.by_lines and camera.distortion != self.support.query.distortion
         return replace(found, scores=found.scores / MIN_GAIN) if is_bent else found
 
-    def searched(self, before: "_Scored", other: "_Scored") -> "_Scored":
+    def searched(self, before: ScoredCamera, other: ScoredCamera) -> ScoredCamera:
         """A camera with the best of three poses: as before, the other camera's, and one found from all matches.
 
         The search by points alone fails where few of them are right. Two cameras then differ by whether it failed.
@@ -221,7 +241,7 @@ class _Compared:
         """
         matches = self.matches_of(self.read_as(before.camera))
         poses = (other.pose, find_pose(matches, LINES))
-        return max([before, *(self._scored(before.camera, matches, it) for it in poses)], key=lambda it: it.total)
+        return max([before, *(ScoredCamera.of(before.camera, matches, it) for it in poses)], key=lambda it: it.total)
 
     def read_as(self, camera: Camera) -> View:
         """The photograph as read with a camera, with every `step`-th keypoint."""
@@ -235,23 +255,6 @@ class _Compared:
             points, keypoint = points[is_seen[keypoint]], keypoint[is_seen[keypoint]]
             lines = lines[is_seen[lines.keypoint]]
         return Evidence(view, self.support.references, lines, points, keypoint)
-
-    def _scored(self, camera: Camera, matches: Evidence, pose: RigidTransform | None) -> "_Scored":
-        count = len(matches.query.features)
-        return _Scored(camera, pose, np.zeros(count) if pose is None else scores_by_keypoint(matches, pose))
-
-
-@dataclass(frozen=True, eq=False)
-class _Scored:
-    """A camera with a pose, None if none was found, and its scores (F,) by keypoint."""
-
-    camera: Camera
-    pose: RigidTransform | None
-    scores: Array
-
-    @property
-    def total(self) -> float:
-        return float(self.scores.sum())
 
 
 @dataclass(frozen=True, eq=False)

@@ -145,7 +145,8 @@ def contradiction(
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     wrong = wrong_intrinsics(evidence, best) if evidence else None
     if wrong:
-        return wrong
+        is_guess = support.intrinsics_sigma is not None and support.intrinsics_sigma.is_guess
+        return (_too_uncertain(support) if is_guess else None) or wrong  # a guess that is unknown is not accused
     if wrong := wrong_camera(support, best):
         return wrong
     hypotheses = find_rival(support, votes)
@@ -223,7 +224,7 @@ def _too_uncertain(support: PosedSupport) -> Rejection | None:
     strongest = np.argsort(-np.array(support.inliers_by_reference()), kind="stable")[:2]
     names = [support.references[i].name for i in strongest]
     if unknown := _unknown_focal(support):
-        advice = "Give the photograph's intrinsics, or take one that shows things at several distances."
+        advice = "Send intrinsics that are certain to less than that, or a photograph of things at several distances."
         hint = Hint("judge", Advice.CHECK_CALIBRATION, advice, names[0])
         return Rejection(RejectionReason.GATE, f"{message}: {unknown}", hint)
     advice = f"Add references that show the same from other places: {' and '.join(names)} alone do not suffice."
