@@ -143,3 +143,12 @@ def test_a_pointer_beyond_all_files_is_as_no_exif(pointer: int) -> None:
     jpeg = encode(".jpg", textured(40, 30))
     data = jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
     assert read_exif(data) == NO_EXIF
+
+
+@pytest.mark.parametrize(("note_bytes", "is_read"), [(60_000, True), (70_000, False)])
+def test_exif_that_no_jpeg_could_have_is_as_none(note_bytes: int, is_read: bool) -> None:
+    exif, out = Image.Exif(), io.BytesIO()
+    exif[ExifTags.Base.Make] = "Maker"
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.MakerNote] = bytes(note_bytes)
+    Image.new("RGB", (40, 30)).save(out, "WEBP", exif=exif)
+    assert (read_exif(out.getvalue()).make == "Maker") == is_read

@@ -12,8 +12,7 @@ from mapless.geometry import Array, RigidTransform
 from mapless_tools.progress import Progress
 
 from .cameras import from_colmap
-from .features import FeatureFolder
-from .matching import SEED
+from .matching import SEED, Evidence
 from .native import interruptible
 from .pictures import Omitted, Part, Picture, PosedPicture
 from .turning import only_turned
@@ -63,13 +62,15 @@ def map_photographs(database: Path, folder: Path, count: int, threads: int, prog
     progress("poses", count, count)
 
 
-def read_parts(database: Path, folder: Path, pictures: Sequence[Picture], features: FeatureFolder) -> tuple[Part, ...]:
+def read_parts(
+    database: Path, folder: Path, pictures: Sequence[Picture], evidence: Sequence[Evidence]
+) -> tuple[Part, ...]:
     """The models of a folder that have parallax, the one with most photographs first."""
     by_name = {it.name: it for it in pictures}
     models = [pycolmap.Reconstruction(str(it)) for it in sorted(folder.iterdir(), key=lambda it: int(it.name))]
     enough = [it for it in models if it.num_reg_images() >= FEWEST]
     moved = [it for it in enough if not only_turned(database, it.reg_image_ids())]
-    parts = [_part(it, by_name, features) for it in moved if _parallax_deg(it) >= PARALLAX_DEG]
+    parts = [_part(it, by_name, evidence) for it in moved if _parallax_deg(it) >= PARALLAX_DEG]
     return tuple(sorted(parts, key=lambda it: -len(it.posed)))
 
 
@@ -126,7 +127,7 @@ def _reason(matches: int) -> str:
     return f"it shares {matches} matches with a photograph that has a pose, too few of them with points"
 
 
-def _part(model: pycolmap.Reconstruction, by_name: Mapping[str, Picture], features: FeatureFolder) -> Part:
+def _part(model: pycolmap.Reconstruction, by_name: Mapping[str, Picture], evidence: Sequence[Evidence]) -> Part:
     points = list(model.points3D.values())
     posed = []
     for image in sorted(model.images.values(), key=lambda it: it.image_id):
@@ -136,10 +137,10 @@ def _part(model: pycolmap.Reconstruction, by_name: Mapping[str, Picture], featur
             camera = from_colmap(model.cameras[image.camera_id])
             posed.append(PosedPicture(by_name[image.name], camera, pose, image.num_points3D))
     x_in_world = np.array([it.xyz for it in points]).reshape(-1, 3)
-    return Part(tuple(posed), x_in_world, _colours(model, points, features), model.compute_mean_reprojection_error())
+    return Part(tuple(posed), x_in_world, _colours(model, points, evidence), model.compute_mean_reprojection_error())
 
 
-def _colours(model: pycolmap.Reconstruction, points: Sequence[pycolmap.Point3D], features: FeatureFolder) -> Array:
+def _colours(model: pycolmap.Reconstruction, points: Sequence[pycolmap.Point3D], evidence: Sequence[Evidence]) -> Array:
     """Mean colours (N, 3) of the keypoints of each point."""
     sums, counts = np.zeros((len(points), 3)), np.zeros(len(points))
     seen: dict[int, list[tuple[int, int]]] = {}
@@ -148,7 +149,8 @@ def _colours(model: pycolmap.Reconstruction, points: Sequence[pycolmap.Point3D],
             seen.setdefault(element.image_id, []).append((row, element.point2D_idx))
     for image_id, pairs in seen.items():
         rows, keypoints = np.array(pairs).T
-        np.add.at(sums, rows, features.colours(model.images[image_id].name)[keypoints])
+        colours = np.concatenate([it.features.colours(model.images[image_id].name) for it in evidence])
+        np.add.at(sums, rows, colours[keypoints])
         np.add.at(counts, rows, 1)
     return np.asarray(sums / np.maximum(counts, 1)[:, None])
 

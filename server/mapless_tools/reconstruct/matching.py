@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from mapless.geometry import Array
 from mapless_server.bounds import check_bounds
 from mapless_server.method.features.matching import Arithmetic, mutual_matches_of_ratios
 from mapless_server.method.features.views import Matches
@@ -109,10 +110,23 @@ class MatchFolder:
         return found[fundamental_inliers(*views, found, _ITERATIONS)]
 
 
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The features of photographs of one kind, their matches, and a key of what these depend on."""
+
+    kind: str
+    features: FeatureFolder
+    matches: MatchFolder
+    key: str
+
+
 def write_database(
-    file: Path, cameras: Sequence[StartingCamera], names: Sequence[str], features: FeatureFolder, matches: MatchFolder
+    file: Path, cameras: Sequence[StartingCamera], names: Sequence[str], evidence: Sequence[Evidence]
 ) -> None:
-    """Writes cameras, keypoints and matches; images are numbered from 1 in the order of the names."""
+    """Writes cameras, keypoints and matches; images are numbered from 1 in the order of the names.
+
+    An image has the keypoints of all kinds of features, those of the first before those of the next.
+    """
     camera_of = {name: number for number, it in enumerate(cameras, 1) for name in it.names}
     image_of = {name: number for number, name in enumerate(names, 1)}
     with pycolmap.Database.open(file) as database, pycolmap.DatabaseTransaction(database):
@@ -129,10 +143,20 @@ def write_database(
             frame.add_data_id(image.data_id)
             database.write_frame(frame, use_frame_id=True)
             database.write_image(image, use_image_id=True)
-            database.write_keypoints(number, in_colmap_pixels(features.view(name)).astype(np.float32))
-        for first in names:
-            for second, found in matches.of(first).items():
-                database.write_matches(image_of[first], image_of[second], found.astype(np.uint32))
+        before = dict.fromkeys(names, 0)
+        keypoints: dict[str, list[Array]] = {name: [] for name in names}
+        matches: dict[tuple[str, str], list[Matches]] = {}
+        for it in evidence:
+            for first in names:
+                for second, found in it.matches.of(first).items():
+                    matches.setdefault((first, second), []).append(found + (before[first], before[second]))
+            for name in names:
+                keypoints[name].append(in_colmap_pixels(it.features.view(name)))
+                before[name] += len(keypoints[name][-1])
+        for name, number in image_of.items():
+            database.write_keypoints(number, np.concatenate(keypoints[name]).astype(np.float32))
+        for (first, second), kinds in matches.items():
+            database.write_matches(image_of[first], image_of[second], np.concatenate(kinds).astype(np.uint32))
 
 
 def verify(file: Path, threads: int) -> None:

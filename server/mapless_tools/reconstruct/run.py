@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,7 +27,7 @@ from mapless_tools.progress import Progress, labelled
 from .cameras import LensOptions, StartingCamera, starting_cameras
 from .features import FeatureFolder
 from .mapping import FEWEST, map_photographs, omitted, read_parts, why_no_part
-from .matching import MatchFolder, PairOptions, pairs_of, verify, write_database
+from .matching import Evidence, MatchFolder, PairOptions, pairs_of, verify, write_database
 from .pictures import Omitted, Part, Picture, Pictures, WorldFrame
 from .sources.finding import WORK
 from .world.options import WorldOptions
@@ -77,16 +77,16 @@ def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, pro
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     chosen = pictures.chosen
     if len(chosen) < FEWEST:
+        notes = "".join(f" ({it})" for it in pictures.notes)
         raise ValueError(
-            f"{len(chosen)} photographs are too few: with fewer than {FEWEST} nothing confirms their poses; take ten "
-            "or more, each showing half of what the one before shows"
+            f"too few photographs, {len(chosen)}: with fewer than {FEWEST} nothing confirms their poses; take ten or "
+            f"more, each showing half of what the one before shows{notes}"
         )
     cameras = starting_cameras(chosen, options.lens)
-    attempt = _attempt(chosen, cameras, work, options, progress)
-    if options.features == AUTO and attempt.largest < len(chosen):
-        # Learned features match what is upright; some photographs may be rolled against the others.
-        other = _attempt(chosen, cameras, work, replace(options, features=ANY_ROLL), labelled(progress, ANY_ROLL))
-        attempt = max(attempt, other, key=lambda it: it.largest)
+    evidence = _evidence(chosen, options, work, progress)
+    attempt = _mapped(chosen, cameras, (evidence,), work, progress)
+    if options.features == AUTO and evidence.kind != ANY_ROLL and attempt.largest < len(chosen):
+        attempt = _with_any_roll(attempt, chosen, cameras, options, work, progress)
     parts = attempt.parts
     if not parts:
         raise ValueError(why_no_part(attempt.database, attempt.models))
@@ -100,8 +100,9 @@ def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, pro
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """The result of one kind of features: the parts, and the files that they are from."""
+    """The parts of a reconstruction, what they are from, and its files."""
 
+    evidence: tuple[Evidence, ...]
     database: Path
     models: Path
     parts: tuple[Part, ...]
@@ -112,47 +113,65 @@ class _Attempt:
         return max((len(it.posed) for it in self.parts), default=0)
 
 
-def _attempt(
+def _with_any_roll(
+    first: _Attempt,
     pictures: Sequence[Picture],
     cameras: Sequence[StartingCamera],
-    work: Path,
     options: ReconstructOptions,
+    work: Path,
     progress: Progress,
 ) -> _Attempt:
-    features, database = _compared(pictures, cameras, work, options, progress)
-    models = database.with_name(f"models-{database.name}")
-    with made_once(models) as made:
-        if made is not None:
-            map_photographs(database, made, len(pictures), available_cores(), progress)
-    return _Attempt(database, models, read_parts(database, models, pictures, features))
+    """A reconstruction in which those that the largest part lacks match by features of any roll, too.
+
+    Learned features match what is upright; some photographs may be rolled against the others.
+    """
+    posed = {it.picture.name for it in first.parts[0].posed} if first.parts else set()
+    rolled = replace(options, features=ANY_ROLL)
+    further = _evidence(pictures, rolled, work, labelled(progress, ANY_ROLL), posed)
+    return _mapped(pictures, cameras, (*first.evidence, further), work, progress)
 
 
-def _compared(
+def _evidence(
     pictures: Sequence[Picture],
-    cameras: Sequence[StartingCamera],
-    work: Path,
     options: ReconstructOptions,
+    work: Path,
     progress: Progress,
-) -> tuple[FeatureFolder, Path]:
-    """The photographs' features, and the database of their matches and of the geometry of each pair."""
+    posed: Collection[str] = (),
+) -> Evidence:
+    """The photographs' features, and their matches; but not of two that are both `posed`."""
     kind, extractor = make_first_features(load_settings({"features": options.features}).settings)
     features = FeatureFolder(work / "features", extractor, pictures)
     features.extract(progress)
     names = [it.name for it in pictures]
     pairs = pairs_of(names, features, VladDescriptor.of(extractor), options.pairs, progress)
+    pairs = [it for it in pairs if it[0] not in posed or it[1] not in posed]
     files = [features.file(it.name).stem for it in pictures]
     ratio = OPTIONS[kind].query_ratio
     key = _digest(__version__, files, names, pairs, ratio)  # another release may write other files
     matches = MatchFolder(work / f"matches-{key}", features, ratio, fastest_arithmetic())
     matches.match(pairs, progress)
-    database = work / f"database-{_digest(key, [repr(it) for it in cameras])}"
+    return Evidence(kind, features, matches, key)
+
+
+def _mapped(
+    pictures: Sequence[Picture],
+    cameras: Sequence[StartingCamera],
+    evidence: tuple[Evidence, ...],
+    work: Path,
+    progress: Progress,
+) -> _Attempt:
+    database = work / f"database-{_digest([it.key for it in evidence], [repr(it) for it in cameras])}"
     with made_once(database) as made:
         if made is not None:
-            write_database(made, cameras, names, features, matches)
+            write_database(made, cameras, [it.name for it in pictures], evidence)
             progress("verification", 0, 1)
             verify(made, available_cores())
             progress("verification", 1, 1)
-    return features, database
+    models = database.with_name(f"models-{database.name}")
+    with made_once(models) as made:
+        if made is not None:
+            map_photographs(database, made, len(pictures), available_cores(), progress)
+    return _Attempt(evidence, database, models, read_parts(database, models, pictures, evidence))
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support.images import encode, textured
 from typer.testing import CliRunner
 
@@ -15,7 +16,9 @@ from mapless.cli.output import plain
 from mapless.geometry import Array, Camera
 from mapless_server.images import ANY_SIZE, decode_image
 from mapless_server.method.features.extractors import SiftExtractor, SiftOptions
+from mapless_server.method.features.views import Ignored, View
 from mapless_server.scenes.retrieval.vlad import VladDescriptor, shipped
+from mapless_server.settings import Settings
 from mapless_tools.cli.app import app
 from mapless_tools.demo.photographs import Photograph, room
 from mapless_tools.ingest.formats.cameras import read_folder
@@ -123,6 +126,33 @@ def test_interrupted_run_continues_to_the_same_poses(source: Path, tmp_path: Pat
     assert {it: it.stat().st_mtime_ns for it in made} == made
     for one, other in zip(again.part.posed, result.part.posed, strict=True):
         np.testing.assert_array_equal(one.world_from_camera.matrix(), other.world_from_camera.matrix())
+
+
+class UprightOnly(SiftExtractor):
+    """Features that find nothing in photographs that are higher than wide, as if they were rolled."""
+
+    name = "upright-only"
+
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
+        return super().extract(image[:1, :1] if len(image) > len(image[0]) else image, camera, ignored)
+
+
+def test_rolled_photographs_join_by_other_features(
+    tmp_path: Path, chosen: Sequence[Photograph], result: Reconstructed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rolled = chosen[3]
+    image = np.rot90(decode_image(rolled.data, ANY_SIZE))
+    turned = replace(rolled, data=encode(".png", np.ascontiguousarray(image)))
+    source = photographs(tmp_path / "photos", [*chosen[:3], turned, *chosen[4:]])
+
+    def features(settings: Settings) -> tuple[str, SiftExtractor]:
+        return ("edgepoint2-l64", UprightOnly()) if settings.features == "auto" else ("sift", SiftExtractor())
+
+    monkeypatch.setattr("mapless_tools.reconstruct.run.make_first_features", features)
+    joined = reconstructed(source, tmp_path / "out", ReconstructOptions())
+    assert len(joined.part.posed) == len(chosen)
+    assert np.median(errors(joined, chosen)) < 0.02
+    assert len(list((tmp_path / "out" / ".work").glob("database-*"))) == 2
 
 
 def test_two_places_become_two_parts(tmp_path: Path, chosen: Sequence[Photograph]) -> None:
