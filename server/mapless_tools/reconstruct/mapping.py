@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
 from mapless.geometry import Array, RigidTransform
-from mapless_tools.progress import Progress
+from mapless_tools.progress import Progress, tracked
 
 from .cameras import from_colmap
 from .matching import SEED, Evidence
 from .native import interruptible
 from .pictures import Omitted, Part, Picture, PosedPicture
+from .refining import refine
 from .turning import only_turned
 
 FEWEST = 3
@@ -32,13 +33,20 @@ _NO_PARALLAX = frozenset(
 )
 
 
-def map_photographs(database: Path, folder: Path, count: int, threads: int, progress: Progress) -> None:
+def map_photographs(
+    database: Path, folder: Path, count: int, known: Collection[int], threads: int, progress: Progress
+) -> None:
     """Writes pycolmap's models of a database into a folder: 0, 1, ...; none if no photographs fit together.
 
     The incremental mapper measures best; where it finds no beginning, the global one, which needs none, is tried.
+    Cameras with the `known` ids stay as they are.
     """
     options = pycolmap.IncrementalPipelineOptions(
-        min_model_size=FEWEST, extract_colors=False, num_threads=threads, random_seed=SEED
+        min_model_size=FEWEST,
+        extract_colors=False,
+        num_threads=threads,
+        random_seed=SEED,
+        constant_cameras=set(known),
     )
     token = pycolmap.CancellationToken()
     registered = 0
@@ -60,6 +68,11 @@ def map_photographs(database: Path, folder: Path, count: int, threads: int, prog
         all_at_once = pycolmap.GlobalPipelineOptions(min_model_size=FEWEST, num_threads=threads, random_seed=SEED)
         interruptible(lambda: pycolmap.global_mapping(database, database.parent, folder, all_at_once))
     progress("poses", count, count)
+    found = sorted(folder.iterdir())
+    for place in tracked("refinement", found, len(found), progress):
+        model = pycolmap.Reconstruction(str(place))
+        if model.num_reg_images() >= FEWEST and refine(model, known, threads):
+            model.write(str(place))
 
 
 def read_parts(

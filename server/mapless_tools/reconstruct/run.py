@@ -170,7 +170,8 @@ def _mapped(
     models = database.with_name(f"models-{database.name}")
     with made_once(models) as made:
         if made is not None:
-            map_photographs(database, made, len(pictures), available_cores(), progress)
+            known = [number for number, it in enumerate(cameras, 1) if it.is_known]
+            map_photographs(database, made, len(pictures), known, available_cores(), progress)
     return _Attempt(evidence, database, models, read_parts(database, models, pictures, evidence))
 
 
