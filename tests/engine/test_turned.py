@@ -24,12 +24,14 @@ from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import MIRROR, Caller, Photo, Query, Result, Tier
 from mapless_server.engine.search import Material, Search
 from mapless_server.images import ImageLimits, decode_image, upright_of
+from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.bundle.priors import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.extractors.turned import extract_turned
 from mapless_server.method.features.rolls import Similarity
 from mapless_server.method.features.views import Ignored, View, view_of
 from mapless_server.method.judge.answer import Localization
+from mapless_server.method.judge.hypothesis import AS_IT_IS
 from mapless_server.method.options import DoubtOptions, LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
@@ -267,10 +269,14 @@ def test_a_photograph_of_elsewhere_stays_rejected(localize: Localize) -> None:
     assert any(stage.endswith(MIRROR) for stage in result.stage_seconds)
 
 
-@pytest.mark.parametrize(("angle_deg", "orientation"), [(90.0, 1), (215.0, 1), (90.0, 6), (215.0, 8)])
-def test_a_gravity_prior_shows_how_to_turn_where_matches_do_not(
-    tmp_path: Path, angle_deg: float, orientation: int
+@pytest.mark.parametrize("orientation", [1, 6, 8])
+@pytest.mark.parametrize(
+    ("angle_deg", "rung"), [(90.0, AS_IT_IS), (180.0, AS_IT_IS), (270.0, AS_IT_IS), (215.0, "turned")]
+)
+def test_a_gravity_prior_turns_a_photograph_by_quarters_at_once(
+    tmp_path: Path, angle_deg: float, rung: str, orientation: int
 ) -> None:
+    """By other angles after the first attempt; also against references that EXIF turns."""
     shots = [held(it, orientation) for it in REFERENCE_POSES]
     image, camera, true = rolled(decode_image(photograph(TRUE), ImageLimits()), angle_deg)
     down = np.array([0.0, 1.0, 0.0])
@@ -279,7 +285,25 @@ def test_a_gravity_prior_shows_how_to_turn_where_matches_do_not(
         result = answer(encode(".png", image), camera, priors=Priors(gravity=prior))
     outcome = result.answer.outcome
     assert isinstance(outcome, Localization)
-    assert [it.rung for it in result.attempts if it.is_chosen] == ["turned"]
+    assert [it.rung for it in result.attempts if it.is_chosen] == [rung]
+    assert (len(result.attempts) == 1) == (rung == AS_IT_IS)
     off_m, off_deg = pose_error(outcome.world_from_camera, true)
     assert off_m < 0.03
     assert off_deg < 0.5
+
+
+def test_a_gravity_prior_turns_a_photograph_as_the_references_are_held(tmp_path: Path) -> None:
+    """All of them on their sides without EXIF, as a robot's camera may be mounted: a photograph held so stays so."""
+    upright = [decode_image(photograph(it), ImageLimits()) for it in REFERENCE_POSES]
+    turned = [rolled(image, 90.0, it) for image, it in zip(upright, REFERENCE_POSES, strict=True)]
+    shots = [Shot(Photo(encode(".png", image), camera, "image"), at) for image, camera, at in turned]
+    down = np.array([0.0, 1.0, 0.0])
+    with localizing(tmp_path, tiers()[:1], shots=shots) as answer:
+        for angle_deg, turn_deg in ((90.0, 0.0), (0.0, 90.0), (270.0, 180.0)):
+            image, camera, true = rolled(decode_image(photograph(TRUE), ImageLimits()), angle_deg)
+            prior = GravityPrior(true.rotation.T @ down, down, 2.0)
+            result = answer(encode(".png", image), camera, priors=Priors(gravity=prior))
+            assert isinstance(result.answer.outcome, Localization)
+            assert [it.rung for it in result.attempts] == [AS_IT_IS]
+            assert isinstance(result.answer.support, PosedSupport)
+            assert result.answer.support.query.upright_deg == turn_deg

@@ -4,6 +4,7 @@ Also how the photograph is rolled against them, and whether references elsewhere
 """
 
 import logging
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,10 +15,12 @@ from scipy.special import bdtrc
 from mapless_server.engine.photo_views import QueryViews, RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
+from mapless_server.images import upright_of
 from mapless_server.method.features.rolls import (
     LEAST_AGREEMENT,
     Similarity,
     are_alike,
+    nearest_quarter,
     rasters_of,
     roll_about_axis,
     roll_of_directions,
@@ -45,6 +48,9 @@ log = logging.getLogger(__name__)
 SHORTLIST = 2
 """Factor on the references wanted: that many are matched with a sample of the photograph, and the best of them used.
 Decision: 025-choosing-references."""
+
+SAMPLED = 5
+"""So many references show how most of a scene are held."""
 
 ALONE_BY_CHANCE = LEAST_AGREEMENT - PROMISE.agreement
 """Difference of the agreement of one reference and of two where both are as likely by chance."""
@@ -74,6 +80,31 @@ def described_anew(search: Search, tier: Tier, any_roll: int | None) -> Material
     with search.context.stage("correspond"):
         matches = tier.pipeline.matcher.match_quickly(found.view, found.references, search.context.check)
     return replace(found, query_matches=tuple(matches))
+
+
+def turned_by_gravity(search: Search, tier: Tier) -> Search:
+    """The search with a photograph that has a gravity prior turned, by quarters, as most references are held.
+
+    Their poses show how gravity lies in the rasters in which they were described; nearly all of a scene are held alike,
+    so a few show it. EXIF, where it says how the photograph was held, comes first. Features that match at any roll
+    need no turn.
+    """
+    query, gravity = search.query, search.query.priors.gravity
+    if gravity is None or tier.any_roll or upright_of(query.photo.image).clockwise_deg:
+        return search
+    ids = query.reference_ids
+    if query.chooses:
+        ids = tuple(search.source.sample(query.scene_key, ids, SAMPLED, search.context))
+    turns = Counter[float]()
+    for it in load_chosen(search, ids, tier)[1] if ids else ():
+        roll_deg = roll_of_directions(gravity.in_camera, it.world_from_camera.rotation.T @ gravity.in_world)
+        if roll_deg is not None:
+            turns[nearest_quarter(roll_deg + it.view.upright_deg)] += 1
+    ((turn_deg, _),) = turns.most_common(1) or [(0.0, 0)]
+    if not turn_deg:
+        return search
+    photo = replace(query.photo, upright_deg=turn_deg)
+    return replace(search, query=replace(query, photo=photo), views=search.views.of(photo))
 
 
 def _narrowing_of(search: Search) -> Narrowing:

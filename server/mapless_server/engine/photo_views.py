@@ -43,8 +43,8 @@ class _Decoded:
 
     @cached_property
     def upright_deg(self) -> float:
-        """By how much the raster has to be turned clockwise to be upright by the photograph's EXIF."""
-        return upright_of(self._photo.image).clockwise_deg
+        """By how much the raster has to be turned clockwise to be upright: by its EXIF, or else by the photo."""
+        return upright_of(self._photo.image).clockwise_deg or self._photo.upright_deg
 
     def read(self, context: StageContext) -> Photograph:
         """The photograph; InvalidArgument if it is bad."""
@@ -67,6 +67,7 @@ class QueryViews:
 
     def __init__(self, photo: Photo, limits: ImageLimits) -> None:
         self.form = RasterForm()
+        self._limits = limits
         self._decoded = _Decoded(photo, limits)
 
     def in_form(self, form: RasterForm) -> QueryViews:
@@ -74,6 +75,10 @@ class QueryViews:
         views = copy(self)
         views.form = form
         return views
+
+    def of(self, photo: Photo) -> QueryViews:
+        """The views of another photograph in the same form."""
+        return QueryViews(photo, self._limits).in_form(self.form)
 
     def view(self, extractor: FeatureExtractor, context: StageContext) -> View:
         """The photograph's view with this extractor's features; InvalidArgument if the image is bad."""

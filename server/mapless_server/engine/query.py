@@ -35,7 +35,8 @@ class Photo:
     """An encoded image and its camera, perhaps with a mask of ignored pixels, a PNG; empty for none.
 
     `field` is the image's path in the request, for error messages. `exif`, of a photograph without intrinsics, is what
-    its camera is chosen by; of `camera` then only the size is known.
+    its camera is chosen by; of `camera` then only the size is known. Where EXIF does not say how the camera was held,
+    features are found in the raster turned clockwise by `upright_deg`.
     """
 
     image: bytes
@@ -43,6 +44,7 @@ class Photo:
     field: str
     mask: bytes = b""
     exif: Exif | None = None
+    upright_deg: float = 0.0
 
     @property
     def size_bytes(self) -> int:

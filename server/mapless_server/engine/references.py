@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import Description, Photo
 from mapless_server.errors import DataLoss, InvalidArgument
@@ -99,6 +101,16 @@ class References:
             vector = own.descriptor.describe(view)
             ranked = rank_references(entries, vector, selection)
         return Choice(tuple(ranked), own.descriptor.name, entries.generation)
+
+    def sample(self, scene_key: SceneKey, among: Sequence[str], count: int, context: StageContext) -> list[str]:
+        """Ids of so many references at most, evenly spread: of the scene's, or of these that it has.
+
+        NotFound if there is no such scene (field "scene").
+        """
+        entries = self._retrievals[0].indexes.entries(scene_key, context)
+        rows = entries.rows(among or None)
+        chosen = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))]
+        return [entries.reference(row)[0] for row in chosen.tolist()]
 
     def _retrieval_of(self, extractor: FeatureExtractor | None) -> Retrieval:
         own = (it for it in self._retrievals if extractor is not None and it.extractor.name == extractor.name)

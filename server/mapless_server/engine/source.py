@@ -44,6 +44,10 @@ class ReferenceSource(Protocol):
         """Chooses references for a photograph, by what is made of this extractor's features if there is such."""
         ...
 
+    def sample(self, scene_key: SceneKey, among: Sequence[str], count: int, context: StageContext) -> Sequence[str]:
+        """Ids of so many references at most, evenly spread: of the scene's, or of these that it has."""
+        ...
+
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Reports that a chosen reference is not used because it is damaged."""
         ...

@@ -185,6 +185,8 @@ class QueryStages:
     def _described(self, search: Search) -> Search | SearchResult:
         """The search with what its attempt is computed from; or what follows if there is nothing to compute."""
         attempt = search.attempt
+        if not search.tried:
+            search = choosing.turned_by_gravity(search, self._verdicts.tier(attempt))
         if attempt.where is Where.NEAR_PRIOR:
             return self._tracked(search)
         if attempt.raster is Raster.MIRRORED:

@@ -138,6 +138,10 @@ class _RenderedReferences:
         """See ReferenceSource."""
         raise NotImplementedError("the warm-up names its references")
 
+    def sample(self, *_: object) -> Sequence[str]:
+        """See ReferenceSource."""
+        raise NotImplementedError("the warm-up names its references")
+
     def report_damaged(self, *_: object) -> None:
         """See ReferenceSource."""
         raise NotImplementedError("what is rendered is not damaged")

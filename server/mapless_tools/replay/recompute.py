@@ -169,6 +169,10 @@ class RecordedSource:
         is_own = {it.descriptor: self.any_roll is not None and it.descriptor.endswith(self.any_roll) for it in choices}
         return next((it for it in choices if is_own[it.descriptor] == wants_own), choices[0])
 
+    def sample(self, scene_key: SceneKey, among: Sequence[str], count: int, context: StageContext) -> list[str]:
+        """Implements ReferenceSource with the captured references, of which most are held as most of the scene's."""
+        return list(self.part.references)[:count]
+
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Implements ReferenceSource: the reference is left out, as in a captured call if it was damaged then."""
         self.references.damaged.append(str(error))

@@ -92,6 +92,11 @@ def roll_of_directions(in_query: Array, in_reference: Array) -> float | None:
     return math.degrees(math.atan2(in_reference[1], in_reference[0]) - math.atan2(in_query[1], in_query[0]))
 
 
+def nearest_quarter(angle_deg: float) -> float:
+    """The quarter turns nearest to an angle: 0, 90, 180 or 270 degrees; rasters turned by these keep their pixels."""
+    return 90.0 * round(angle_deg / 90) % 360
+
+
 def roll_about_axis(roll_deg: float) -> Array:
     """The rotation (3, 3) of a camera rolled by so much in the other's frame, both with the same optical axis."""
     cos, sin = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
