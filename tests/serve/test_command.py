@@ -21,6 +21,7 @@ TOOLS = {
     "replay": ["folder"],
     "replay-bag": ["recording", "scene", "out"],
     "reconstruct": ["photographs", "out"],
+    "extend": ["scene", "photographs"],
     "view": ["scene"],
     "gateway": [],
     "demo": [],
@@ -67,7 +68,7 @@ def test_a_wrong_flag_ends_serve_with_one_line(flags: list[str], message: str) -
 def test_a_tool_without_its_packages_says_what_to_install(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "missing_package", lambda extra: "absent")
     ended = CliRunner().invoke(commands.app, [name, *TOOLS[name]])
-    extra = name if name in ("view", "gateway", "reconstruct") else "tools"
+    extra = {"extend": "reconstruct"}.get(name, name if name in ("view", "gateway", "reconstruct") else "tools")
     assert ended.exit_code == 2
     assert ended.stderr == f"mapless-server: {name} needs the Python package absent: {how_to_install(extra)}\n"
 

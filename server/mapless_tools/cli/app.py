@@ -13,6 +13,7 @@ from mapless_server.extras import missing_package
 from mapless_server.serve.command import fail, serve_command
 from mapless_tools.draw.command import draw_command
 from mapless_tools.evaluate.cli import evaluate_command
+from mapless_tools.extend.command import extend_command
 from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
 from mapless_tools.reconstruct.command import reconstruct_command
@@ -82,6 +83,7 @@ app.add_typer(weights_app, name="weights")
 _add_tool("import", import_command, cls=ImportCommand)
 _add_tool("export", export_command)
 _add_tool("reconstruct", reconstruct_command, extra="reconstruct", cls=ImportCommand)
+_add_tool("extend", extend_command, extra="reconstruct")
 _add_tool("audit", audit_command)
 _add_tool("draw", draw_command)
 _add_tool("evaluate", evaluate_command)

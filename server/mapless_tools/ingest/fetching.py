@@ -29,13 +29,19 @@ class Export:
 
 
 def fetch_all(
-    client: Client, scene: str, take: Callable[[Reference], T], progress: Progress, pictures: int | None = None
+    client: Client,
+    scene: str,
+    take: Callable[[Reference], T],
+    progress: Progress,
+    pictures: int | None = None,
+    wanted: frozenset[str] | None = None,
 ) -> tuple[list[T], dict[str, str]]:
-    """Calls `take`, in threads, for each reference; returns its results in order, and messages about damaged ones.
+    """Calls `take`, in threads, for each reference, or for each of the `wanted` ids.
 
-    So many `pictures`, evenly spread, have their photographs; None for all. ValueError if the scene has no references.
+    Returns its results in order, and messages about damaged ones by their ids. So many `pictures`, evenly spread, have
+    their photographs; None for all. ValueError if the scene has no references.
     """
-    references = _reference_ids(client, scene)
+    references = [it for it in _reference_ids(client, scene) if wanted is None or it in wanted]
     if not references:
         raise ValueError(f"scene {scene} has no references")
     step = 1 if pictures is None else -(-len(references) // pictures)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera
 from mapless_server import __version__
-from mapless_server.images import ANY_SIZE, decode_image, upright_of
+from mapless_server.images import ANY_SIZE, decode_image, decode_mask, upright_of
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.extractors.turned import extract_upright
 from mapless_server.method.features.views import Features, View
@@ -73,7 +73,10 @@ class FeatureFolder:
         image = decode_image(data, ANY_SIZE)
         height, width = image.shape[:2]
         camera = _plain_camera(width, height)
-        view = extract_upright(self._extractor, image, camera, upright_of(data).clockwise_deg)
+        upright_deg, ignored = upright_of(data).clockwise_deg, None
+        if picture.mask_path is not None:
+            ignored = decode_mask(picture.mask_path.read_bytes(), (width, height), ANY_SIZE)
+        view = extract_upright(self._extractor, image, camera, upright_deg, ignored=ignored)
         share = np.divide((width, height), (view.camera.width_px, view.camera.height_px))
         pixels = (view.features.pixels() + 0.5) * share - 0.5
         column, row = np.rint(pixels).astype(int).T
@@ -99,4 +102,5 @@ def _plain_camera(width: int, height: int) -> Camera:
 
 
 def _digest(picture: Picture, extractor: str) -> str:
-    return hashlib.sha256(picture.path.read_bytes() + f"{extractor} {__version__}".encode()).hexdigest()[:32]
+    mask = b"" if picture.mask_path is None else picture.mask_path.read_bytes()
+    return hashlib.sha256(picture.path.read_bytes() + mask + f"{extractor} {__version__}".encode()).hexdigest()[:32]

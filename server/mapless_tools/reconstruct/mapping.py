@@ -129,12 +129,12 @@ def omitted(part: Part, parts: Sequence[Part], pictures: Sequence[Picture], data
             if other in found:
                 shared[one] = max(shared[one], count)
     of_other = {it.picture.name: f"it is in part {i}" for i, other in enumerate(parts, 1) for it in other.posed}
-    return tuple(
-        Omitted(name, of_other.get(name) or _reason(shared[name])) for name in images.values() if name not in found
-    )
+    left_out = [it for it in images.values() if it not in found]
+    return tuple(Omitted(it, of_other.get(it) or matches_reason(shared[it])) for it in left_out)
 
 
-def _reason(matches: int) -> str:
+def matches_reason(matches: int) -> str:
+    """Why a photograph has no pose that shares at most so many matches with one that has."""
     if matches < FEWEST_MATCHES:
         return f"too few matches: no photograph with a pose shares {FEWEST_MATCHES} that agree"
     return f"it shares {matches} matches with a photograph that has a pose, too few of them with points"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -46,6 +46,10 @@ class PairOptions:
         check_bounds(self, "all_below similar", at_least=0)
         if not self.steps or min(self.steps) < 1:
             raise ValueError(f"steps must be at least 1, are {self.steps}")
+
+
+ChoosePairs = Callable[[Sequence[str], FeatureFolder, VladDescriptor, PairOptions, Progress], list[tuple[str, str]]]
+"""A function like `pairs_of`."""
 
 
 def pairs_of(

@@ -24,7 +24,8 @@ class Picture:
 
     `path` is the file that the reconstruction will have: a JPEG, PNG or WebP of `width_px` times `height_px` pixels as
     stored. `orientation` says how the raster has to be turned to be upright, as in EXIF; it is not applied. `source` is
-    the file that it was given in, a video or a photograph.
+    the file that it was given in, a video or a photograph. The mask, a PNG of the same size, is 0 at the pixels to
+    ignore; None without one.
     """
 
     name: str
@@ -34,6 +35,7 @@ class Picture:
     source: Path
     exif: Exif = NO_EXIF
     time: VideoTime | None = None
+    mask_path: Path | None = None
 
     @property
     def orientation(self) -> int:

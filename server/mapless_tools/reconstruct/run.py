@@ -27,7 +27,7 @@ from mapless_tools.progress import Progress, labelled
 from .cameras import LensOptions, StartingCamera, starting_cameras
 from .features import FeatureFolder
 from .mapping import FEWEST, map_photographs, omitted, read_parts, why_no_part
-from .matching import Evidence, MatchFolder, PairOptions, pairs_of, verify, write_database
+from .matching import ChoosePairs, Evidence, MatchFolder, PairOptions, pairs_of, verify, write_database
 from .pictures import Omitted, Part, Picture, Pictures, WorldFrame
 from .sources.finding import WORK
 from .world.options import WorldOptions
@@ -83,7 +83,7 @@ def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, pro
             f"more, each showing half of what the one before shows{notes}"
         )
     cameras = starting_cameras(chosen, options.lens)
-    evidence = _evidence(chosen, options, work, progress)
+    evidence = gather(chosen, options, work, progress)
     attempt = _mapped(chosen, cameras, (evidence,), work, progress)
     if options.features == AUTO and evidence.kind != ANY_ROLL and attempt.largest < len(chosen):
         attempt = _with_any_roll(attempt, chosen, cameras, options, work, progress)
@@ -127,23 +127,24 @@ def _with_any_roll(
     """
     posed = {it.picture.name for it in first.parts[0].posed} if first.parts else set()
     rolled = replace(options, features=ANY_ROLL)
-    further = _evidence(pictures, rolled, work, labelled(progress, ANY_ROLL), posed)
+    further = gather(pictures, rolled, work, labelled(progress, ANY_ROLL), posed)
     return _mapped(pictures, cameras, (*first.evidence, further), work, progress)
 
 
-def _evidence(
+def gather(
     pictures: Sequence[Picture],
     options: ReconstructOptions,
     work: Path,
     progress: Progress,
     posed: Collection[str] = (),
+    choose: ChoosePairs = pairs_of,
 ) -> Evidence:
-    """The photographs' features, and their matches; but not of two that are both `posed`."""
+    """The photographs' features, and the matches of chosen pairs; but not of two that are both `posed`."""
     kind, extractor = make_first_features(load_settings({"features": options.features}).settings)
     features = FeatureFolder(work / "features", extractor, pictures)
     features.extract(progress)
     names = [it.name for it in pictures]
-    pairs = pairs_of(names, features, VladDescriptor.of(extractor), options.pairs, progress)
+    pairs = choose(names, features, VladDescriptor.of(extractor), options.pairs, progress)
     pairs = [it for it in pairs if it[0] not in posed or it[1] not in posed]
     files = [features.file(it.name).stem for it in pictures]
     ratio = OPTIONS[kind].query_ratio
@@ -160,6 +161,23 @@ def _mapped(
     work: Path,
     progress: Progress,
 ) -> _Attempt:
+    database = database_of(pictures, cameras, evidence, work, progress)
+    models = database.with_name(f"models-{database.name}")
+    with made_once(models) as made:
+        if made is not None:
+            known = [number for number, it in enumerate(cameras, 1) if it.is_known]
+            map_photographs(database, made, len(pictures), known, available_cores(), progress)
+    return _Attempt(evidence, database, models, read_parts(database, models, pictures, evidence))
+
+
+def database_of(
+    pictures: Sequence[Picture],
+    cameras: Sequence[StartingCamera],
+    evidence: tuple[Evidence, ...],
+    work: Path,
+    progress: Progress,
+) -> Path:
+    """The database of photographs, with the geometry of each pair that was matched."""
     database = work / f"database-{_digest([it.key for it in evidence], [repr(it) for it in cameras])}"
     with made_once(database) as made:
         if made is not None:
@@ -167,12 +185,7 @@ def _mapped(
             progress("verification", 0, 1)
             verify(made, available_cores())
             progress("verification", 1, 1)
-    models = database.with_name(f"models-{database.name}")
-    with made_once(models) as made:
-        if made is not None:
-            known = [number for number, it in enumerate(cameras, 1) if it.is_known]
-            map_photographs(database, made, len(pictures), known, available_cores(), progress)
-    return _Attempt(evidence, database, models, read_parts(database, models, pictures, evidence))
+    return database
 
 
 @contextmanager

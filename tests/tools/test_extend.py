@@ -1,0 +1,137 @@
+"""`mapless-server extend`: photographs are placed where they were taken, among references that stay as they are."""
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.commands import run
+from support.images import encode
+from support.servers import RunningServer
+from typer.testing import Result
+
+from mapless import Accuracy, Client, Provenance
+from mapless.geometry import RigidTransform, rotation_angle_deg
+from mapless_server.images import ANY_SIZE, decode_image
+from mapless_tools.demo.photographs import Photograph, room
+from mapless_tools.extend.accuracy import USUAL_POSITION, USUAL_ROTATION, Factors, _factors, accuracy_of
+from mapless_tools.extend.model import Estimate
+
+UNIT = 2.0
+"""Of the scene, per metre: its unit is arbitrary."""
+
+
+def half(it: Photograph, negative: bool = False) -> Photograph:
+    """The photograph at half its size, in the scene's unit; its negative shows another room."""
+    image = cv2.resize(decode_image(it.data, ANY_SIZE), (480, 360), interpolation=cv2.INTER_AREA)
+    data = encode(".png", np.asarray(255 - image if negative else image, np.uint8))
+    pose = RigidTransform(it.world_from_camera.rotation, UNIT * it.world_from_camera.translation)
+    return Photograph(it.name, data, it.camera.resized(480, 360), pose)
+
+
+REFERENCES = room().references[:9]
+NEW, OTHER = REFERENCES[1:8:2], room().references[9]
+"""Photographs to place, and one whose negative fits nothing."""
+
+
+@pytest.fixture
+def scene(client: Client) -> Iterator[str]:
+    """References 0, 2, 4, 6 and 8 of the rendered room."""
+    name = f"extend-{time.monotonic_ns()}"
+    client.create_scene(name, arbitrary_unit=True)
+    client.add_references(name, [half(it).reference() for it in REFERENCES[::2]])
+    yield name
+    client.delete_scene(name)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("extend") / "photos"
+    folder.mkdir()
+    for it in NEW:
+        (folder / f"{it.name}.png").write_bytes(half(it).data)
+    (folder / "elsewhere.png").write_bytes(half(OTHER, negative=True).data)
+    return folder
+
+
+def extended(server: RunningServer, scene: str, photos: Path, *flags: object) -> Result:
+    work = ["--work", photos.parent / "work", "--features", "sift"]
+    return run("extend", scene, photos, *work, *flags, "--address", server.address)
+
+
+def poses(client: Client, scene: str) -> dict[str, bytes]:
+    return {it.reference_id: it.world_from_camera.matrix().tobytes() for it in client.list_references(scene)}
+
+
+def test_photographs_are_placed_where_they_were_taken(
+    server: RunningServer, client: Client, scene: str, photos: Path, tmp_path: Path
+) -> None:
+    before = poses(client, scene)
+    done = extended(server, scene, photos, "--report", tmp_path / "report.json")
+    assert done.exit_code == 0, done.output
+    assert f"{len(NEW)} of {len(NEW) + 1} photographs are placed in scene {scene}" in done.stdout
+    assert "elsewhere: not placed, too few matches" in done.stdout
+    stored = {it.reference_id: it for it in client.list_references(scene)}
+    assert set(stored) == set(before) | {it.name for it in NEW}
+    for it in map(half, NEW):
+        found = stored[it.name]
+        assert found.provenance.source == "PLACED"
+        accuracy = found.provenance.accuracy
+        assert accuracy is not None
+        off = np.linalg.norm(found.world_from_camera.translation - it.world_from_camera.translation)
+        assert off <= accuracy.position_95_m <= 0.05 * UNIT * 5
+        turned = rotation_angle_deg(found.world_from_camera.rotation.T @ it.world_from_camera.rotation)
+        assert turned <= accuracy.rotation_95_deg <= 2
+    assert {name: pose for name, pose in poses(client, scene).items() if name in before} == before
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["stored"], report["arbitrary_unit"]) == ([it.name for it in NEW], True)
+    again = extended(server, scene, photos)
+    assert f"{NEW[0].name}: it is in the scene already, as reference {NEW[0].name}" in again.stdout
+    assert len(poses(client, scene)) == len(stored)
+
+
+def test_a_dry_run_stores_nothing(server: RunningServer, client: Client, scene: str, photos: Path) -> None:
+    before = poses(client, scene)
+    done = extended(server, scene, photos, "--dry-run")
+    assert done.exit_code == 0, done.output
+    assert f"{NEW[0].name}: placed, position within" in done.stdout
+    assert poses(client, scene) == before
+
+
+@pytest.mark.parametrize(
+    ("count", "said"),
+    [(0, "has no references: from fewer than 2"), (1, "has one reference: from fewer than 2"), (None, "no scene")],
+    ids=["empty", "one", "absent"],
+)
+def test_a_scene_with_too_little_is_refused(
+    server: RunningServer, client: Client, photos: Path, count: int | None, said: str
+) -> None:
+    name = f"little-{count}-{time.monotonic_ns()}"
+    if count is not None:
+        client.create_scene(name)
+        for it in REFERENCES[:count]:
+            client.add_reference(name, half(it).reference())
+    done = extended(server, name, photos)
+    assert done.exit_code in (1, 2)
+    assert said in done.stderr
+
+
+def test_factors_of_few_references_are_mostly_the_usual_ones() -> None:
+    none = _factors(np.zeros((0, 2)))
+    assert (none.position, none.rotation, none.count) == pytest.approx((USUAL_POSITION, USUAL_ROTATION, 0))
+    many = _factors(np.full((1000, 2), 1.5))
+    assert (many.position, many.rotation) == pytest.approx((1.5, 1.5), rel=0.05)
+
+
+def test_errors_of_placed_references_are_added() -> None:
+    estimate = Estimate(RigidTransform.identity(), np.diag([1e-4] * 3 + [1e-6] * 3))
+    placed = Provenance("PLACED", Accuracy(0.3, 0.6, 1.0, 2.0))
+    known = {"given": Provenance(), "placed": placed}
+    alone = accuracy_of(estimate, Factors(2.0, 3.0, 9), {"given": 10, "placed": 0}, known)
+    both = accuracy_of(estimate, Factors(2.0, 3.0, 9), {"given": 50, "placed": 50}, known)
+    assert alone.position_68_m == pytest.approx(2 * 0.01 * 1.872, rel=0.01)
+    assert both.position_68_m == pytest.approx(math.hypot(alone.position_68_m, 0.3 / math.sqrt(2)))
