@@ -63,6 +63,10 @@ MAX_RADIUS_SHARE = 0.08
 """Largest 68 % radius of the position, as a share of the distance to what the photograph shows: of the poses with a
 larger one too many are wrong. Evidence: largest-radius."""
 
+MAX_GUESSED_RADIUS_SHARE = 0.04
+"""The same where the intrinsics are a guess: most of the radius is then an error of the distance that no other evidence
+shows. Evidence: unknown-camera."""
+
 LEVELS = (
     0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0,
 )  # fmt: skip
@@ -145,8 +149,7 @@ def contradiction(
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     wrong = wrong_intrinsics(evidence, best) if evidence else None
     if wrong:
-        is_guess = support.intrinsics_sigma is not None and support.intrinsics_sigma.is_guess
-        return (_too_uncertain(support) if is_guess else None) or wrong  # a guess that is unknown is not accused
+        return (_too_uncertain(support) if _is_guessed(support) else None) or wrong  # what is unknown is not accused
     if wrong := wrong_camera(support, best):
         return wrong
     hypotheses = find_rival(support, votes)
@@ -215,11 +218,12 @@ def format_evidence(evidence: Evidence) -> str:
 def _too_uncertain(support: PosedSupport) -> Rejection | None:
     """Rejects a pose whose own radius says that it may well be wrong."""
     share = accuracy_from_covariance(support.estimate.covariance).position_68_m / support.distance_m()
-    if share <= MAX_RADIUS_SHARE:
+    largest = MAX_GUESSED_RADIUS_SHARE if _is_guessed(support) else MAX_RADIUS_SHARE
+    if share <= largest:
         return None
     message = (
         f"its position is known to {100 * share:.1f} % of the distance to what the photograph shows (68 % radius), "
-        f"{100 * MAX_RADIUS_SHARE:g} % is needed"
+        f"{100 * largest:g} % is needed"
     )
     strongest = np.argsort(-np.array(support.inliers_by_reference()), kind="stable")[:2]
     names = [support.references[i].name for i in strongest]
@@ -229,6 +233,10 @@ def _too_uncertain(support: PosedSupport) -> Rejection | None:
         return Rejection(RejectionReason.GATE, f"{message}: {unknown}", hint)
     advice = f"Add references that show the same from other places: {' and '.join(names)} alone do not suffice."
     return Rejection(RejectionReason.GATE, message, Hint("judge", Advice.ADD_REFERENCES, advice, names[0]))
+
+
+def _is_guessed(support: PosedSupport) -> bool:
+    return support.intrinsics_sigma is not None and support.intrinsics_sigma.is_guess
 
 
 def _unknown_focal(support: PosedSupport) -> str:
