@@ -30,6 +30,7 @@ from .answers import (
 )
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
+from .depth import DepthImage, DepthNoise, DepthSensor
 from .diagnostics import Attempt, Debug, Diagnostics, LadderCut, ReferenceUse, ScaleEstimate
 from .errors import (
     AlreadyExists,
@@ -80,6 +81,9 @@ __all__ = [
     "Datum",
     "DeadlineExceeded",
     "Debug",
+    "DepthImage",
+    "DepthNoise",
+    "DepthSensor",
     "Diagnostics",
     "FailedPrecondition",
     "Fisheye",

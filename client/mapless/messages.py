@@ -15,6 +15,7 @@ import numpy as np
 
 from . import names, wire
 from .answers import Accuracy, Hypothesis, LocalizationResult, Rejected, UsedIntrinsics
+from .depth import DepthImage, depth_from_message
 from .diagnostics import Attempt, Debug, Diagnostics
 from .geodesy import Datum, GeoPose
 from .geometry import Array, Camera, Quaternion, RigidTransform, Similarity
@@ -138,6 +139,7 @@ _READERS: dict[Any, Callable[[Any, str], Any]] = {
     Calibration: calibration_from_message,
     Camera: wire.camera_from_message,
     Datum: datum_from_message,
+    DepthImage: depth_from_message,
     Debug: _debug,
     Diagnostics: _diagnostics,
     GeoPose: _geo_pose,

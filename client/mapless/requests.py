@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from . import wire
+from .depth import DepthImage, depth_to_message
 from .geometry import Camera, RigidTransform, nearest_rotation
 from .names import shown
 from .provenance import GIVEN_POSE, Provenance, provenance_to_message
@@ -19,7 +20,7 @@ class NewReference:
     """A reference to be stored: id within the scene, photograph, its camera and its pose (metric).
 
     The mask, a PNG of the photograph's size or its path, is 0 at the pixels to ignore; None: all are used. `provenance`
-    says how the pose is known.
+    says how the pose is known. The depth was measured with the photograph; None without one.
     """
 
     reference_id: str
@@ -28,6 +29,7 @@ class NewReference:
     world_from_camera: RigidTransform
     mask: ImageSource | None = None
     provenance: Provenance = GIVEN_POSE
+    depth: DepthImage | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ def create_request(
             world_from_camera=world_from_camera,
             mask=read_mask(reference.mask, f"{field}.mask"),
             provenance=provenance_to_message(reference.provenance),
+            depth=None if reference.depth is None else depth_to_message(reference.depth, f"{field}.depth"),
         ),
     )
 

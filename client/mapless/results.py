@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
+from .depth import DepthImage
 from .geodesy import Datum
 from .geometry import Camera, RigidTransform
 from .provenance import GIVEN_POSE, Provenance
@@ -54,6 +55,8 @@ class Reference:
         image: the file's bytes, if requested.
         mask: the bytes of its mask's file, if requested and there is one.
         mask_sha256: hash of that file, hexadecimal; empty without a mask.
+        depth: the depth that was measured with it, if the image is requested and there is one.
+        depth_sha256: hash of that depth with all that describes it, hexadecimal; empty without one.
         warnings: contradictions of the scene's datum, direction of gravity and unit and the poses stored in the same
             message, which `add_reference` and `add_references` found, and that the scene contradicts itself, as far as
             that was known; else empty.
@@ -72,6 +75,8 @@ class Reference:
     mask: bytes | None = field(default=None, repr=False)
     mask_sha256: str = ""
     provenance: Provenance = GIVEN_POSE
+    depth: DepthImage | None = field(default=None, repr=False)
+    depth_sha256: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.cameras import with_slashes
+from mapless.depth import DepthImage, DepthNoise, DepthSensor
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.provenance import GIVEN_POSE, Provenance
@@ -32,12 +33,43 @@ Parsed = TypeVar("Parsed")
 
 
 @dataclass(frozen=True, eq=False)
+class DepthFile:
+    """The depth of a photograph in files: its values, and perhaps their confidence; the rest is as in `DepthImage`."""
+
+    path: Path
+    unit_m: float
+    sensor: DepthSensor = DepthSensor.UNKNOWN
+    camera: Camera | None = None
+    camera_from_depth_camera: RigidTransform | None = None
+    confidence_path: Path | None = None
+    min_confidence: int = 1
+    noise: DepthNoise | None = None
+    size: tuple[int, int] | None = None
+
+    def read(self) -> DepthImage:
+        """Reads the files; OSError."""
+        confidence = b"" if self.confidence_path is None else self.confidence_path.read_bytes()
+        return DepthImage(
+            self.path.read_bytes(),
+            self.unit_m,
+            self.size,
+            self.sensor,
+            self.camera,
+            self.camera_from_depth_camera,
+            confidence,
+            self.min_confidence,
+            self.noise,
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """A photograph whose pose is known, in metres, or in the dataset's unit if it is not metric.
 
     Its name is a legal reference id; the EXIF orientation of its file is not to be applied. The split is "train" for
     frames that a benchmark builds its references from, "test" for its queries, empty if unknown. The mask, a PNG of the
-    photograph's size, is 0 at the pixels to ignore; None without one. `provenance` says how the pose is known.
+    photograph's size, is 0 at the pixels to ignore; None without one. `provenance` says how the pose is known. The
+    depth was measured with it; None without one.
     """
 
     name: str
@@ -47,6 +79,7 @@ class Frame:
     split: str = ""
     mask_path: Path | None = None
     provenance: Provenance = GIVEN_POSE
+    depth: DepthFile | None = None
 
     def __post_init__(self) -> None:
         if self.split not in SPLITS:
@@ -57,6 +90,10 @@ class Frame:
         data = self.image_path.read_bytes()
         pixels, upright_deg = decode_image(data, limits), upright_of(data).clockwise_deg
         return extract_upright(extractor, pixels, self.camera, upright_deg, ignored=self.read_ignored())
+
+    def read_depth(self) -> DepthImage | None:
+        """Its depth, None without one; OSError."""
+        return None if self.depth is None else self.depth.read()
 
     def read_ignored(self) -> NDArray[np.bool_] | None:
         """The ignored pixels, (H, W); None if all are used. InvalidArgument or OSError if the mask is bad."""

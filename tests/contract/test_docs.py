@@ -167,6 +167,8 @@ def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
         known: dict[str, Any] = {
             "poses": {"a": pose(0.0).matrix(), "b": pose(1.0).matrix()},
             "xyz": pose(0.0).translation,
+            "depth_m": np.full((1067, 1600), 1.5, np.float32),
+            "world_from_camera": pose(2.0),
             "down_in_camera": np.array([0.0, 1.0, 0.0]),
             "rig_from_left": RigidTransform.identity(),
             "rig_from_right": pose(0.5),

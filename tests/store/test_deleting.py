@@ -14,6 +14,7 @@ from sqlalchemy import Connection
 from support.stores import EXTRACTOR, Folder, Place, Shared, assert_same_view, faults_of, make_reference, view_of
 from support.waiting import wait_until
 
+from mapless import DepthImage
 from mapless_server import errors
 from mapless_server.method.features.matching import StoredPair
 from mapless_server.method.features.views import KeptDepth
@@ -88,7 +89,7 @@ def test_all_that_refers_to_a_scene_goes_with_it(place: Place) -> None:
 
     with place.open() as store:
         keys = fill(store, OFFICE)
-        store.add_references(OFFICE, [replace(make_reference("masked"), mask=b"mask")])
+        store.add_references(OFFICE, [replace(make_reference("masked"), mask=b"mask", depth=DepthImage(b"", 1.0))])
         pairs, progress = PairStore(store.database), Progress()
         while claim := pairs.claim("nearest", progress):
             made = {(keys[0], claim.key): StoredPair(np.zeros((1, 2), np.int32))} if claim.key != keys[0] else {}

@@ -15,7 +15,18 @@ from support.layouts import CAMERA, assert_same_camera, assert_same_pose, by_nam
 from support.servers import RunningServer, serving
 from support.stores import damage
 
-from mapless import Accuracy, Client, Datum, NewReference, Provenance, Scene
+from mapless import (
+    Accuracy,
+    Client,
+    Datum,
+    DepthImage,
+    DepthNoise,
+    DepthSensor,
+    NewReference,
+    Provenance,
+    RigidTransform,
+    Scene,
+)
 from mapless.geodesy import enu_from_y_up
 from mapless.lenses import Fisheye, RadialTangential
 from mapless_server.security import SceneKey
@@ -180,3 +191,37 @@ def test_a_scene_to_look_at_is_one_file(
     assert file.name == f"{scene}.glb"
     names = {*trimesh.load(file).graph.nodes}
     assert {it.reference_id for it in references} | {f"photograph of {it.reference_id}" for it in references} <= names
+
+
+def test_depths_come_back_bit_by_bit(server: RunningServer, client: Client, tmp_path: Path) -> None:
+    """With whatever is said of them, as PNG and as float32; an import again finds nothing new."""
+    scene, again = f"deep-{time.monotonic_ns()}", f"again-{time.monotonic_ns()}"
+    size = CAMERA.height_px, CAMERA.width_px
+    full = DepthImage(
+        encode(".png", np.full((60, 80), 1500, np.uint16)),
+        0.0002,
+        None,
+        DepthSensor.STRUCTURED_LIGHT,
+        replace(CAMERA.resized(80, 60), distortion=Fisheye(0.1, 0.0, 0.0, 0.0)),
+        RigidTransform(np.eye(3), np.array([-0.0225, -0.005, 0.0])),
+        encode(".png", np.full((60, 80), 2, np.uint8)),
+        2,
+        DepthNoise(0.001, 0.002, 0.003, 0.004),
+    )
+    metres = DepthImage.of_metres(np.full(size, 1.5, np.float32), DepthSensor.RENDERED)
+    depths = [full, metres, None]
+    client.create_scene(scene)
+    client.add_references(
+        scene,
+        [
+            NewReference(f"r{i}", encode(".png", textured(seed=i)), CAMERA, truth().poses[i], depth=depth)
+            for i, depth in enumerate(depths)
+        ],
+    )
+    done = run("export", scene, tmp_path / "out", "--address", server.address)
+    assert done.exit_code == 0, done.output
+    for text in ("3 added", "3 skipped"):
+        done = run("import", tmp_path / "out", again, "--skip-check", "--address", server.address)
+        assert (done.exit_code, text in done.stdout) == (0, True), done.output
+    hashes = [it.depth_sha256 for it in client.list_references(again)]
+    assert hashes == [it.depth_sha256 for it in client.list_references(scene)] == [full.sha256, metres.sha256, ""]

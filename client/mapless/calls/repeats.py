@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import wire
 from ..connection import Connection
+from ..depth import depth_from_message
 from ..errors import MaplessError, NotFound
 from ..geometry import Array
 from ..messages import reference_from_message, scene_from_message
@@ -63,6 +64,8 @@ def difference(wanted: pb.Reference, stored: Reference) -> str:
         return "photograph"
     if stored.mask_sha256 != (hashlib.sha256(wanted.mask).hexdigest() if wanted.HasField("mask") else ""):
         return "mask"
+    if stored.depth_sha256 != (depth_from_message(wanted.depth, "depth").sha256 if wanted.HasField("depth") else ""):
+        return "depth"
     if wire.camera_to_message(stored.camera) != wanted.intrinsics:
         return "intrinsics"
     ours = wire.transform_from_message(wanted.world_from_camera, "").matrix()

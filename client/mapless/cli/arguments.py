@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 from mapless_command.installation import how_to_install
 
 from ..client import Client
+from ..depth import DepthSensor
 from ..options import ConnectOptions
 from ..shortcut import ADDRESS_VARIABLE, TOKEN_VARIABLE, default_address
 from ..text_files import read_text
@@ -295,6 +296,22 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     add.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
     add.add_argument("--pose", required=True, help="its world_from_camera, likewise")
     add.add_argument("--mask", type=Path, metavar="FILE", help=f"{_MASK}")
+    add.add_argument(
+        "--depth", type=Path, metavar="FILE", help="its depth: a PNG of 16 bits, of the same camera or --depth-camera"
+    )
+    add.add_argument(
+        "--depth-unit", type=float, default=0.001, metavar="M", help="metres of 1 in it (default: 0.001, millimetres)"
+    )
+    add.add_argument(
+        "--depth-sensor",
+        choices=[it.value for it in DepthSensor],
+        default=DepthSensor.UNKNOWN.value,
+        help="the kind of sensor, by which its errors are known (default: unknown)",
+    )
+    add.add_argument("--depth-camera", metavar="CAMERA", help="the camera of the depth, if it is another, as --camera")
+    add.add_argument(
+        "--depth-pose", metavar="POSE", help="camera_from_depth_camera, if that is elsewhere, in the form of --pose"
+    )
     add.set_defaults(run=commands.add_reference)
     listing = actions.add_parser("list", help="all references of a scene")
     listing.add_argument("scene")

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..cameras import read_camera, read_pose
 from ..client import Client
+from ..depth import DepthImage, DepthSensor
 from ..geodesy import Datum
 from ..geometry import Quaternion, RigidTransform
 from ..lenses import lens_model_of
@@ -127,12 +128,26 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
         camera=read_camera(arguments.camera, arguments.photo),
         world_from_camera=read_pose(arguments.pose),
         mask=arguments.mask,
+        depth=_depth(arguments),
     )
     stored = client.add_reference(arguments.scene, reference)
     if not stored.feature_count:
         print(f"mapless: warning: {arguments.photo} is stored, but has no local features: {_BLANK}", file=sys.stderr)
     _warn(stored.warnings)
     return show(arguments, stored, _reference_card(stored))
+
+
+def _depth(arguments: argparse.Namespace) -> DepthImage | None:
+    """The depth that was measured with a photograph; None without one."""
+    if arguments.depth is None:
+        return None
+    return DepthImage(
+        arguments.depth.read_bytes(),
+        arguments.depth_unit,
+        sensor=DepthSensor(arguments.depth_sensor),
+        camera=None if arguments.depth_camera is None else read_camera(arguments.depth_camera, arguments.depth),
+        camera_from_depth_camera=None if arguments.depth_pose is None else read_pose(arguments.depth_pose),
+    )
 
 
 def _id_of(photo: Path) -> str:

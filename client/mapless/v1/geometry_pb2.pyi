@@ -1,8 +1,24 @@
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from typing import ClassVar as _ClassVar, Mapping as _Mapping, Optional as _Optional, Union as _Union
 
 DESCRIPTOR: _descriptor.FileDescriptor
+
+class DepthSensor(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DEPTH_SENSOR_UNSPECIFIED: _ClassVar[DepthSensor]
+    DEPTH_SENSOR_TIME_OF_FLIGHT: _ClassVar[DepthSensor]
+    DEPTH_SENSOR_STRUCTURED_LIGHT: _ClassVar[DepthSensor]
+    DEPTH_SENSOR_STEREO: _ClassVar[DepthSensor]
+    DEPTH_SENSOR_PHONE_LIDAR: _ClassVar[DepthSensor]
+    DEPTH_SENSOR_RENDERED: _ClassVar[DepthSensor]
+DEPTH_SENSOR_UNSPECIFIED: DepthSensor
+DEPTH_SENSOR_TIME_OF_FLIGHT: DepthSensor
+DEPTH_SENSOR_STRUCTURED_LIGHT: DepthSensor
+DEPTH_SENSOR_STEREO: DepthSensor
+DEPTH_SENSOR_PHONE_LIDAR: DepthSensor
+DEPTH_SENSOR_RENDERED: DepthSensor
 
 class Vector3(_message.Message):
     __slots__ = ("x", "y", "z")
@@ -79,3 +95,41 @@ class CameraIntrinsics(_message.Message):
     radial_tangential: RadialTangentialDistortion
     fisheye: FisheyeDistortion
     def __init__(self, width_px: _Optional[int] = ..., height_px: _Optional[int] = ..., focal_x_px: _Optional[float] = ..., focal_y_px: _Optional[float] = ..., principal_x_px: _Optional[float] = ..., principal_y_px: _Optional[float] = ..., radial_tangential: _Optional[_Union[RadialTangentialDistortion, _Mapping]] = ..., fisheye: _Optional[_Union[FisheyeDistortion, _Mapping]] = ...) -> None: ...
+
+class DepthImage(_message.Message):
+    __slots__ = ("png", "float32", "unit_m", "width_px", "height_px", "intrinsics", "camera_from_depth_camera", "confidence", "min_confidence", "sensor", "noise")
+    PNG_FIELD_NUMBER: _ClassVar[int]
+    FLOAT32_FIELD_NUMBER: _ClassVar[int]
+    UNIT_M_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_PX_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_PX_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_FROM_DEPTH_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    NOISE_FIELD_NUMBER: _ClassVar[int]
+    png: bytes
+    float32: bytes
+    unit_m: float
+    width_px: int
+    height_px: int
+    intrinsics: CameraIntrinsics
+    camera_from_depth_camera: RigidTransform
+    confidence: bytes
+    min_confidence: int
+    sensor: DepthSensor
+    noise: DepthNoise
+    def __init__(self, png: _Optional[bytes] = ..., float32: _Optional[bytes] = ..., unit_m: _Optional[float] = ..., width_px: _Optional[int] = ..., height_px: _Optional[int] = ..., intrinsics: _Optional[_Union[CameraIntrinsics, _Mapping]] = ..., camera_from_depth_camera: _Optional[_Union[RigidTransform, _Mapping]] = ..., confidence: _Optional[bytes] = ..., min_confidence: _Optional[int] = ..., sensor: _Optional[_Union[DepthSensor, str]] = ..., noise: _Optional[_Union[DepthNoise, _Mapping]] = ...) -> None: ...
+
+class DepthNoise(_message.Message):
+    __slots__ = ("constant_m", "linear", "quadratic_per_m", "common")
+    CONSTANT_M_FIELD_NUMBER: _ClassVar[int]
+    LINEAR_FIELD_NUMBER: _ClassVar[int]
+    QUADRATIC_PER_M_FIELD_NUMBER: _ClassVar[int]
+    COMMON_FIELD_NUMBER: _ClassVar[int]
+    constant_m: float
+    linear: float
+    quadratic_per_m: float
+    common: float
+    def __init__(self, constant_m: _Optional[float] = ..., linear: _Optional[float] = ..., quadratic_per_m: _Optional[float] = ..., common: _Optional[float] = ...) -> None: ...

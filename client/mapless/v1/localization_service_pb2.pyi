@@ -46,6 +46,7 @@ class ScaleSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SCALE_SOURCE_UNSPECIFIED: _ClassVar[ScaleSource]
     SCALE_SOURCE_REFERENCES: _ClassVar[ScaleSource]
     SCALE_SOURCE_NETWORK: _ClassVar[ScaleSource]
+    SCALE_SOURCE_DEPTH: _ClassVar[ScaleSource]
 
 class IntrinsicsParameter(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -119,6 +120,7 @@ class ScaleStage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SCALE_STAGE_TRIANGULATION: _ClassVar[ScaleStage]
     SCALE_STAGE_TRAJECTORY: _ClassVar[ScaleStage]
     SCALE_STAGE_NETWORK: _ClassVar[ScaleStage]
+    SCALE_STAGE_DEPTH: _ClassVar[ScaleStage]
 AXES_UNSPECIFIED: Axes
 AXES_OPENCV: Axes
 AXES_ARKIT: Axes
@@ -142,6 +144,7 @@ INTRINSICS_SOURCE_ESTIMATED: IntrinsicsSource
 SCALE_SOURCE_UNSPECIFIED: ScaleSource
 SCALE_SOURCE_REFERENCES: ScaleSource
 SCALE_SOURCE_NETWORK: ScaleSource
+SCALE_SOURCE_DEPTH: ScaleSource
 INTRINSICS_PARAMETER_UNSPECIFIED: IntrinsicsParameter
 INTRINSICS_PARAMETER_FOCAL_LENGTH: IntrinsicsParameter
 INTRINSICS_PARAMETER_PRINCIPAL_X: IntrinsicsParameter
@@ -191,6 +194,7 @@ SCALE_STAGE_UNSPECIFIED: ScaleStage
 SCALE_STAGE_TRIANGULATION: ScaleStage
 SCALE_STAGE_TRAJECTORY: ScaleStage
 SCALE_STAGE_NETWORK: ScaleStage
+SCALE_STAGE_DEPTH: ScaleStage
 
 class LocalizeRequest(_message.Message):
     __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "intrinsics_uncertainty", "mask")

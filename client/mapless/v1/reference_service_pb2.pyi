@@ -114,7 +114,7 @@ class SceneCalibration(_message.Message):
     def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., reference_noise_m: _Optional[float] = ..., reference_noise_deg: _Optional[float] = ..., grows_with_gap: bool = ...) -> None: ...
 
 class Reference(_message.Message):
-    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance")
+    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance", "depth", "depth_sha256")
     NAME_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
@@ -125,6 +125,8 @@ class Reference(_message.Message):
     MASK_FIELD_NUMBER: _ClassVar[int]
     MASK_SHA256_FIELD_NUMBER: _ClassVar[int]
     PROVENANCE_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_SHA256_FIELD_NUMBER: _ClassVar[int]
     name: str
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
@@ -135,7 +137,9 @@ class Reference(_message.Message):
     mask: bytes
     mask_sha256: str
     provenance: Provenance
-    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ...) -> None: ...
+    depth: _geometry_pb2.DepthImage
+    depth_sha256: str
+    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., depth_sha256: _Optional[str] = ...) -> None: ...
 
 class Provenance(_message.Message):
     __slots__ = ("source", "accuracy")

@@ -17,6 +17,7 @@ from mapless_server.method.options import ChosenCamera, Variant
 from mapless_server.store import SceneAttributes, calibration_kind
 
 if TYPE_CHECKING:  # services need not load what computes
+    from mapless.depth import DepthImage
     from mapless.geometry import Camera
     from mapless_server.images.exif import Exif
     from mapless_server.method.features.extractors import FeatureExtractor
@@ -32,7 +33,7 @@ if TYPE_CHECKING:  # services need not load what computes
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """An encoded image and its camera, perhaps with a mask of ignored pixels, a PNG; empty for none.
+    """An encoded image and its camera, perhaps with a mask of ignored pixels, a PNG; empty for none; and with depth.
 
     `field` is the image's path in the request, for error messages. `exif`, of a photograph without intrinsics, is what
     its camera is chosen by; of `camera` then only the size is known. Where EXIF does not say how the camera was held,
@@ -45,11 +46,12 @@ class Photo:
     mask: bytes = b""
     exif: Exif | None = None
     upright_deg: float = 0.0
+    depth: DepthImage | None = None
 
     @property
     def size_bytes(self) -> int:
-        """Size of the encoded image and mask."""
-        return len(self.image) + len(self.mask)
+        """Size of the encoded image, mask and depth."""
+        return len(self.image) + len(self.mask) + (0 if self.depth is None else self.depth.size_bytes)
 
     def read_ignored(self, limits: ImageLimits) -> Ignored | None:
         """Decodes the mask; None if there is none or it ignores nothing. InvalidArgument if it is bad."""
@@ -69,12 +71,13 @@ class Description:
     """The data that the store keeps of a photograph besides the photograph itself.
 
     Views, without pixels, are by the extractor's name, the first tier's first; descriptors by their own. The mask
-    ignores a share of the pixels, 0 to 1.
+    ignores a share of the pixels, 0 to 1; the depth has a median in the unit of poses, None without depth.
     """
 
     views: Mapping[str, View]
     descriptors: Mapping[str, Vector]
     ignored_share: float = 0.0
+    median_depth: float | None = None
 
 
 PREPARE, COARSE, REFINE = "prepare", "coarse", "refine"

@@ -8,7 +8,7 @@ import numpy as np
 from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import Description, Photo
 from mapless_server.errors import DataLoss, InvalidArgument
-from mapless_server.images import ImageLimits
+from mapless_server.images import ImageLimits, decode_depth
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.scenes import Choice, Selection, rank_references
@@ -130,7 +130,14 @@ class References:
         if share == 1:
             message = "the mask ignores the whole image: 0 means ignore, every other value use"
             raise InvalidArgument(message, reason="MASK_IGNORES_ALL", field=photo.mask_field)
-        return Description(without_pixels, vectors, share)
+        return Description(without_pixels, vectors, share, self._median_depth(photo))
+
+    def _median_depth(self, photo: Photo) -> float | None:
+        """Median of a photograph's depth, None without depth; InvalidArgument if it is bad."""
+        if photo.depth is None:
+            return None
+        size, field = (photo.camera.width_px, photo.camera.height_px), photo.field.removesuffix("image") + "depth"
+        return float(np.nanmedian(decode_depth(photo.depth, size, self._limits, field)))
 
     def auditor(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneAuditor:
         """Makes an auditor of a scene's references; the caller named those in `named`."""

@@ -16,7 +16,7 @@ from .bundle.pose_problem import AdjustOptions
 from .bundle.priors import NO_PRIORS, Priors
 from .coarse import Outcome, Reconstructor, Request, Triangulation, reconstruct_one
 from .coarse.geometric import GeometricReconstructor, point_maps
-from .coarse.scale import estimate_scale, known_scale, network_scale
+from .coarse.scale import depth_scale, estimate_scale, known_scale, network_scale
 from .features.views import Matches, PosedView, Reconstruction, View
 from .judge.answer import Answer, Localization, shifted
 from .judge.judge import JudgeOptions
@@ -281,6 +281,8 @@ def _scaled(prepared: Prepared, reconstruction: Outcome) -> Coarse:
         if isinstance(reconstruction, Triangulation):
             if prepared.options.variant in (Variant.BEST, Variant.COARSE):
                 structure, pose = reconstruction.structure, reconstruction.world_from_query
+                if len(references) == 1:
+                    return Coarse(prepared, reconstruction, depth_scale(references[0], pose))
                 return Coarse(prepared, reconstruction, known_scale(structure, pose, references, strategy))
             reconstruction = point_maps(reconstruction, prepared.query, references)
         if len(references) == 1 and reconstruction.metre_sigma is not None:

@@ -1,14 +1,16 @@
 """One attempt at a pose: scale > structure > match > pnp > gate > adjust > covariance > judge.
 
-Where one reference is given the points are those of a network's depths; `Solver.LINES` needs no points at all.
+Where one reference is given the points are those of its depths; `Solver.LINES` needs no points at all.
 """
 
 from dataclasses import replace
 
+import numpy as np
+
 from .bundle.adjust import adjust_pose, with_covariance
 from .bundle.estimate import PosedSupport, Support, with_halves
 from .bundle.pose_problem import AdjustInput
-from .features.views import Reconstruction
+from .features.views import Matches, PosedView, Reconstruction
 from .judge.answer import Answer, Localization
 from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
@@ -25,7 +27,7 @@ from .judge.two_view import (
 )
 from .options import DoubtOptions, Variant
 from .pipeline import Coarse, structure_and_matches, unverified, wide_correspondences, with_wide_correspondences
-from .pose.one_reference import solve_one_reference
+from .pose.one_reference import FIRST_DEPTH_SIGMA, MatchedDepths, solve_one_reference
 from .pose.pnp import gate_failure, solve_pose
 from .pose.two_view import TwoViewOptions, solve_two_view
 from .rejection import Rejection, RejectionReason
@@ -59,7 +61,7 @@ def _from_points(coarse: Coarse) -> Answer:
         return coarse.answer(scale)
     if prepared.options.variant is Variant.COARSE:
         return coarse.answer(unverified(scale))
-    if scale.stage is ScaleStage.NETWORK:
+    if scale.is_from_depth:
         return _from_one_reference(coarse, scale)
     query, references, options, priors = prepared.query, prepared.references, prepared.pipeline.options, prepared.priors
     structure, matches = structure_and_matches(coarse, scale)
@@ -112,13 +114,13 @@ def _judged(support: PosedSupport, coarse: Coarse, chance: float, agreement: flo
 
 
 def _from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
-    """Estimates the pose from a single reference with a network's depths; priors are compared with it, but not used."""
-    prepared = coarse.prepared
-    assert isinstance(coarse.reconstruction, Reconstruction)
+    """Estimates the pose from a single reference with depths; priors are compared with it, but not used."""
+    prepared, initial = coarse.prepared, scale.world_from_query
     (reference,), (matches,) = prepared.references, prepared.correspondences.query_matches
-    (predicted,), fixed = coarse.reconstruction.references, prepared.pipeline.matcher.pairs.stationary
+    origin, fixed = prepared.origin, prepared.pipeline.matcher.pairs.stationary
+    depths = _depths_of_matches(coarse, scale, reference, matches)
     with prepared.context.stage("pnp"):
-        found = solve_one_reference(prepared.query, reference, matches, predicted, scale, prepared.origin, fixed)
+        found = solve_one_reference(prepared.query, reference, matches, depths, initial, origin, fixed)
     if isinstance(found, Rejection):
         return coarse.answer(found)
     estimate = found.support.estimate
@@ -130,6 +132,19 @@ def _from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
     return coarse.answer(replace(Localization.of(estimate, trust), scale_source=scale.source), support)
+
+
+def _depths_of_matches(coarse: Coarse, scale: MetricScale, reference: PosedView, matches: Matches) -> MatchedDepths:
+    """Depths of the matched keypoints of a single reference: its own, or those that the coarse stage predicts."""
+    if scale.stage is ScaleStage.DEPTH:
+        assert reference.depths is not None
+        known = np.isfinite(reference.depths.depth)
+        sigma = float(np.median(reference.depths.relative_sigma[known]))
+        return MatchedDepths(reference.depths.depth[matches[:, 1]].astype(np.float64), sigma, scale.relative_sigma)
+    assert isinstance(coarse.reconstruction, Reconstruction)
+    (predicted,), view = coarse.reconstruction.references, reference.view
+    depth = scale.metres_per_unit * predicted.depth_at(view.features.pixels(matches[:, 1]), view.camera)
+    return MatchedDepths(depth, FIRST_DEPTH_SIGMA, scale.relative_sigma)
 
 
 def _from_lines(coarse: Coarse) -> Answer:

@@ -27,6 +27,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneState, Store
 
+from .measured import MeasuredDepths
 from .stored import DepthFinder
 
 log = logging.getLogger(__name__)
@@ -86,6 +87,7 @@ class ReferenceLibrary:
         """`depths` adds stored depths to references; None adds none."""
         self._store = store
         self._depths = depths
+        self._measured = MeasuredDepths(store)
         self.locks = KeyedLocks()
         self._exifs: LruCache[Exif] = LruCache(_REMEMBERED_EXIFS)
         self._background = ThreadPoolExecutor(1, "describe")
@@ -120,13 +122,22 @@ class ReferenceLibrary:
                 views = tuple(map(self.posed_view, snapshot.references))
                 if self._depths is not None:
                     views = self._depths.with_depths(views, extractor.name)
-                return snapshot.scene, views
+                return snapshot.scene, self._with_measured_depths(snapshot.references, views, extractor.name)
             if not waits:
                 self._describe_later(snapshot.undescribed, extractor)
                 raise FeaturesMissing
             _log_describing(snapshot.undescribed, extractor)
             with context.stage("describe"):
                 self._describe_all(snapshot.undescribed, extractor, context.check)
+
+    def _with_measured_depths(
+        self, references: Sequence[DescribedReference], views: tuple[PosedView, ...], extractor: str
+    ) -> tuple[PosedView, ...]:
+        """The references with the depths that were measured with them, in place of others."""
+        if not any(it.record.depth_sha256 for it in references):
+            return views
+        both = zip(references, views, strict=True)
+        return tuple(self._measured.with_depth(it.record, view, extractor) for it, view in both)
 
     def _describe_later(self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
         with self._scheduling:

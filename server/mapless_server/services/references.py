@@ -10,6 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from mapless import names, wire
+from mapless.depth import depth_to_message
 from mapless.geometry import MAX_COORDINATE_M, RigidTransform
 from mapless.provenance import Provenance
 from mapless.v1 import reference_service_pb2 as pb
@@ -38,6 +39,7 @@ from .messages.queries import (
     reference_ids_from_names,
     reference_key_from_name,
     scene_key_from_name,
+    with_depth,
 )
 from .messages.references import (
     Page,
@@ -46,6 +48,7 @@ from .messages.references import (
     audit_to_message,
     changes_from_message,
     choice_to_message,
+    implausible_depths,
     nearly_ignored,
     new_provenance,
     reference_to_message,
@@ -230,6 +233,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             message.image = await self._stored(self._store.read_image_of, record.key)
             if record.mask_sha256:
                 message.mask = await self._stored(self._store.read_mask_of, record.key)
+            if record.depth_sha256:
+                depth = await self._stored(self._store.read_depth_of, record.key)
+                message.depth.CopyFrom(depth_to_message(depth))
         return pb.GetReferenceResponse(reference=message)
 
     async def ListReferences(self, request: pb.ListReferencesRequest, call: Call) -> pb.ListReferencesResponse:
@@ -316,7 +322,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         world_from_camera = wire.transform_from_message(
             reference.world_from_camera, f"{path}.world_from_camera", MAX_COORDINATE_M
         )
-        photo = photo_from_message(reference, path, self._engine().options.image_limits)
+        limits = self._engine().options.image_limits
+        photo = with_depth(photo_from_message(reference, path, limits), reference, path, limits)
         return Draft(reference_id, photo, world_from_camera, new_provenance(reference, path))
 
     async def _add(
@@ -338,6 +345,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
                 found.descriptors,
                 it.photo.mask,
                 it.provenance,
+                it.photo.depth,
             )
             for it, found in zip(drafts, described, strict=True)
         ]
@@ -349,7 +357,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         agreements.changed(scene_key)
         warnings += await self._stored(self._said_of, scene_key, agreements.known(scene_key))
         shares = {it.reference_id: found.ignored_share for it, found in zip(records, described, strict=True)}
-        return records, [*warnings, *nearly_ignored(shares)]
+        depths = {it.reference_id: found.median_depth for it, found in zip(records, described, strict=True)}
+        return records, [*warnings, *nearly_ignored(shares), *implausible_depths(depths)]
 
     def _said_of(self, scene_key: SceneKey, agreement: Agreement) -> list[str]:
         """Returns what is said of a scene's agreement; nothing of a unit that cannot be read."""

@@ -53,7 +53,7 @@ VIEW_FORMAT_VERSION, SMALL_VIEW_FORMAT_VERSION = 1, 2
 DEPTH_FORMAT_VERSION = 1
 _DEPTH_STEP = 0.01
 _LARGEST_STEP = 60_000
-_PREFIX = struct.Struct("<B3xI")
+PREFIX = struct.Struct("<B3xI")
 _ALIGNMENT_BYTES = 16
 _FLOAT32 = np.dtype("<f4")
 _FLOAT16 = np.dtype("<f2")
@@ -79,8 +79,8 @@ def encode_geometry(camera: Camera, world_from_camera: RigidTransform, provenanc
     """
     pose = {"rotation": world_from_camera.rotation.tolist(), "translation": world_from_camera.translation.tolist()}
     known = provenance_to_json(provenance)
-    content = {"camera": _camera_to_dict(camera), "world_from_camera": pose}
-    return _to_json(content if known is None else content | {"provenance": known})
+    content = {"camera": camera_to_dict(camera), "world_from_camera": pose}
+    return to_json(content if known is None else content | {"provenance": known})
 
 
 def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, RigidTransform, Provenance]:
@@ -95,7 +95,7 @@ def decode_geometry(owner: str, data: bytes, sha256: str) -> tuple[Camera, Rigid
         rotation.setflags(write=False)
         translation.setflags(write=False)
         provenance = provenance_from_json(content.get("provenance"))
-        return _camera_from_dict(content["camera"]), RigidTransform(rotation, translation), provenance
+        return camera_from_dict(content["camera"]), RigidTransform(rotation, translation), provenance
 
 
 def encode_attributes(attributes: SceneAttributes) -> bytes | None:
@@ -109,7 +109,7 @@ def encode_attributes(attributes: SceneAttributes) -> bytes | None:
         del content["contradiction"]
     if attributes.calibration is not None and attributes.calibration.create_time is not None:
         content["calibration"]["create_time"] = attributes.calibration.create_time.isoformat()
-    return _to_json(content)
+    return to_json(content)
 
 
 def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> SceneAttributes:
@@ -134,7 +134,7 @@ def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> Sce
 
 def encode_calibration(calibration: SelfCalibration) -> bytes:
     """A self-calibration as JSON; ValueError if a number is not finite."""
-    return _to_json(asdict(calibration))
+    return to_json(asdict(calibration))
 
 
 def decode_calibration(owner: str, data: bytes, sha256: str) -> SelfCalibration:
@@ -180,9 +180,9 @@ def _blob(version: int, view: View, how: dict[str, Any], arrays: Sequence[NDArra
     count, dimension = view.features.descriptors.shape
     if view.upright_deg:
         how = how | {"upright_deg": view.upright_deg}
-    header = _to_json({"camera": _camera_to_dict(view.camera), "count": count, "dimension": dimension} | how)
-    header += b" " * (-(_PREFIX.size + len(header)) % _ALIGNMENT_BYTES)
-    return b"".join([_PREFIX.pack(version, len(header)), header, *(array.tobytes() for array in arrays)])
+    header = to_json({"camera": camera_to_dict(view.camera), "count": count, "dimension": dimension} | how)
+    header += b" " * (-(PREFIX.size + len(header)) % _ALIGNMENT_BYTES)
+    return b"".join([PREFIX.pack(version, len(header)), header, *(array.tobytes() for array in arrays)])
 
 
 def decode_view(owner: str, blob: bytes, sha256: str) -> View:
@@ -191,11 +191,11 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
     Damaged if the checksum does not match, or the format is unknown.
     """
     with _checked(owner, blob, sha256, "features"):
-        version, header_length = _PREFIX.unpack_from(blob)
+        version, header_length = PREFIX.unpack_from(blob)
         if version not in (VIEW_FORMAT_VERSION, SMALL_VIEW_FORMAT_VERSION):
             raise Damaged(f"features (format {version} is unknown)")
-        offset = _PREFIX.size + header_length
-        header = json.loads(blob[_PREFIX.size : offset])
+        offset = PREFIX.size + header_length
+        header = json.loads(blob[PREFIX.size : offset])
         count, dimension = header["count"], header["dimension"]
         if version == SMALL_VIEW_FORMAT_VERSION:
             features = _small_features(blob[offset:], header, count, dimension)
@@ -203,7 +203,7 @@ def decode_view(owner: str, blob: bytes, sha256: str) -> View:
             floats = np.frombuffer(blob, _FLOAT32, offset=offset)
             keypoints, sizes_px, descriptors = np.split(floats, [2 * count, 3 * count])
             features = Features(keypoints.reshape(count, 2), descriptors.reshape(count, dimension), sizes_px)
-        return View(_camera_from_dict(header["camera"]), features, upright_deg=header.get("upright_deg", 0.0))
+        return View(camera_from_dict(header["camera"]), features, upright_deg=header.get("upright_deg", 0.0))
 
 
 def _small_features(body: bytes, header: dict[str, Any], count: int, dimension: int) -> Features:
@@ -289,9 +289,9 @@ def encode_depth(kept: KeptDepth) -> bytes:
     differences = np.diff(np.diff(filled, axis=1, prepend=0), axis=0, prepend=0)
     words = ((differences << 1) ^ (differences >> 63)).astype("<u4")  # small ones of either sign as small numbers
     planes = words.reshape(-1, 1).view(np.uint8).reshape(-1, 4).T[:3]
-    header = _to_json({"camera": _camera_to_dict(kept.camera), "first": first, "sigma": kept.relative_sigma})
+    header = to_json({"camera": camera_to_dict(kept.camera), "first": first, "sigma": kept.relative_sigma})
     body = zlib.compress(planes.tobytes() + np.packbits(known).tobytes(), 9)
-    return b"".join([_PREFIX.pack(DEPTH_FORMAT_VERSION, len(header)), header, body])
+    return b"".join([PREFIX.pack(DEPTH_FORMAT_VERSION, len(header)), header, body])
 
 
 def decode_depth(owner: str, blob: bytes, sha256: str) -> KeptDepth:
@@ -300,12 +300,12 @@ def decode_depth(owner: str, blob: bytes, sha256: str) -> KeptDepth:
     Damaged if the checksum or the form of the data is wrong, or the format is unknown.
     """
     with _checked(owner, blob, sha256, "depth"):
-        version, header_length = _PREFIX.unpack_from(blob)
+        version, header_length = PREFIX.unpack_from(blob)
         if version != DEPTH_FORMAT_VERSION:
             raise Damaged(f"depth (format {version} is unknown)")
-        offset = _PREFIX.size + header_length
-        header = json.loads(blob[_PREFIX.size : offset])
-        camera = _camera_from_dict(header["camera"])
+        offset = PREFIX.size + header_length
+        header = json.loads(blob[PREFIX.size : offset])
+        camera = camera_from_dict(header["camera"])
         shape = camera.height_px, camera.width_px
         size = shape[0] * shape[1]
         data = np.frombuffer(zlib.decompress(blob[offset:]), np.uint8)
@@ -335,7 +335,8 @@ def _checked(owner: str, data: object, sha256: str, what: str) -> Iterator[None]
         raise Damaged(f"{what} (of an unknown form)") from error
 
 
-def _to_json(content: dict[str, Any]) -> bytes:
+def to_json(content: dict[str, Any]) -> bytes:
+    """Compact JSON; ValueError if a number is not finite."""
     return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
 
 
@@ -344,14 +345,16 @@ def _calibration_from_dict(content: dict[str, Any]) -> SelfCalibration:
     return SelfCalibration(**(content | lists))
 
 
-def _camera_to_dict(camera: Camera) -> dict[str, Any]:
+def camera_to_dict(camera: Camera) -> dict[str, Any]:
+    """A camera as values of JSON, its lens with the name of the model."""
     content = asdict(camera)
     if camera.distortion is not None:
         content["distortion"] = {"model": lens_model_of(camera.distortion), **asdict(camera.distortion)}
     return content
 
 
-def _camera_from_dict(content: dict[str, Any]) -> Camera:
+def camera_from_dict(content: dict[str, Any]) -> Camera:
+    """The camera that `camera_to_dict` was given."""
     distortion: Distortion | None = None
     if content["distortion"] is not None:
         parameters = dict(content["distortion"])

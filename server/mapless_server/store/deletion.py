@@ -18,7 +18,7 @@ from mapless_server.security import SceneKey
 
 from .database import DamagedPages, Database, with_room_to_delete
 from .queries import DETACHED, is_detached
-from .tables import features, global_descriptor, image, mask, reference, reference_depth, reference_pair, scene
+from .tables import depth, features, global_descriptor, image, mask, reference, reference_depth, reference_pair, scene
 
 logger = logging.getLogger(__name__)
 
@@ -179,7 +179,7 @@ def next_portion(connection: Connection, at_most: int) -> Sequence[str]:
     keys = connection.scalars(pending.limit(at_most).with_for_update(skip_locked=True)).all()
     if len(keys) <= 1:  # where pages are damaged even the size may not be readable
         return keys
-    owners = [it.c.reference_key for it in (image, mask, features, global_descriptor, reference_depth)]
+    owners = [it.c.reference_key for it in (image, mask, depth, features, global_descriptor, reference_depth)]
     size_bytes = sum(map(_size_bytes, [*owners, reference_pair.c.first_key]), literal(0))
     sizes = connection.scalars(select(size_bytes).where(column.key.in_(keys)).order_by(column.key))
     return keys[: max(1, bisect_right(list(accumulate(sizes)), PORTION_BYTES))]

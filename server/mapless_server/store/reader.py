@@ -8,6 +8,7 @@ from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, 
 
 from sqlalchemy import Connection, Row, Select, Table, select
 
+from mapless.depth import DepthImage
 from mapless.geometry import Camera, RigidTransform
 from mapless_server.cache import LruCache
 from mapless_server.errors import AlreadyExists, NotFound, RequestError
@@ -205,13 +206,21 @@ class StoreReader:
         """Reads the mask's bytes, empty if the reference has none; errors as of `read_image_of`."""
         return self._read_file(key, tables.mask)
 
+    @observed
+    def read_depth_of(self, key: str) -> DepthImage:
+        """Reads the depth that was measured with a reference that has one; errors as of `read_image_of`."""
+        return self._read_part(key, tables.depth, rows.depth_image)
+
     def _read_file(self, key: str, table: Table) -> bytes:
+        return self._read_part(key, table, rows.file)
+
+    def _read_part(self, key: str, table: Table, read: Callable[[Row[Any], str], T]) -> T:
         with self.database.read() as connection:
             row = unless_damaged(connection, lambda: queries.find_file(connection, key, table), lambda: None)
             if row is None:
                 reference_id = queries.find_by_key(connection, key, tables.reference.c.reference_id).reference_id
                 raise rows.data_loss(reference_id, table.name)
-            return rows.file(row, table.name)
+            return read(row, table.name)
 
     @observed
     def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mapless.depth import DepthImage
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.provenance import GIVEN_POSE, Provenance
@@ -166,6 +167,7 @@ class NewReference:
         descriptors: global descriptors (D,) by name; stored as float16.
         mask: the bytes of its mask's file, unchanged; empty for none.
         provenance: how its pose is known.
+        depth: the depth that was measured with it; None without one.
     """
 
     reference_id: str
@@ -176,6 +178,7 @@ class NewReference:
     descriptors: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     mask: bytes = b""
     provenance: Provenance = GIVEN_POSE
+    depth: DepthImage | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +196,7 @@ class ReferenceRecord:
         create_time: when it was created, UTC.
         mask_sha256: hash of its mask's bytes, hexadecimal; empty without a mask.
         provenance: how its pose is known.
+        depth_sha256: `DepthImage.sha256` of its depth; empty without one.
     """
 
     scene_key: SceneKey
@@ -205,6 +209,7 @@ class ReferenceRecord:
     create_time: datetime
     mask_sha256: str = ""
     provenance: Provenance = GIVEN_POSE
+    depth_sha256: str = ""
 
     @property
     def scene_id(self) -> str:

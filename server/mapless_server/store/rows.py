@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Row
 
+from mapless.depth import DepthImage
 from mapless_server.errors import DataLoss
 from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 from . import codec
+from .depth_images import decode_depth_image
 from .records import (
     DescribedReference,
     IndexedReference,
@@ -112,6 +114,7 @@ def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) ->
         create_time=create_time,
         mask_sha256=hashlib.sha256(new.mask).hexdigest() if new.mask else "",
         provenance=new.provenance,
+        depth_sha256="" if new.depth is None else new.depth.sha256,
     )
 
 
@@ -128,6 +131,7 @@ def reference_row(record: ReferenceRecord) -> dict[str, Any]:
         "feature_count": record.feature_count,
         "create_time_us": time_us(record.create_time),
         "mask_sha256": record.mask_sha256 or None,
+        "depth_sha256": record.depth_sha256 or None,
     }
 
 
@@ -148,6 +152,7 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
         create_time=time_of(row.create_time_us),
         mask_sha256=row.mask_sha256 or "",
         provenance=provenance,
+        depth_sha256=row.depth_sha256 or "",
     )
 
 
@@ -223,6 +228,14 @@ def file(row: Row[Any], what: str) -> bytes:
     if not isinstance(data, bytes) or hashlib.sha256(data).hexdigest() != row.sha256:
         raise data_loss(row.reference_id, what)
     return data
+
+
+def depth_image(row: Row[Any], what: str) -> DepthImage:
+    """Reads the depth of a row of `queries.find_file`; raises DataLoss if it is damaged or missing."""
+    try:
+        return decode_depth_image(row.data, row.sha256 or "")
+    except codec.Damaged as error:
+        raise data_loss(row.reference_id, what) from error
 
 
 def data_loss(reference_id: str, what: str) -> DataLoss:

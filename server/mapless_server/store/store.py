@@ -24,6 +24,7 @@ from mapless_server.security import SceneKey, scene_id_of
 from . import deletion, queries, rows, tables
 from .database import DamagedPages, Database, with_room_to_delete
 from .deletion import PendingDeletions
+from .depth_images import encode_depth_image
 from .postgresql import PostgresqlDatabase
 from .reader import NAME_CACHE_BYTES, StoreReader, observed
 from .records import DescribedReference, NewReference, ReferenceRecord, SceneAttributes, SceneRecord
@@ -198,12 +199,14 @@ class Store(StoreReader):
         # Encoding takes milliseconds per reference, so it is done before other writers have to wait.
         records = [rows.new_record(scene_key, new, now) for new in references]
         reference_rows = [rows.reference_row(record) for record in records]
-        image_rows, mask_rows, features_rows, descriptor_rows = [], [], [], []
+        image_rows, mask_rows, depth_rows, features_rows, descriptor_rows = [], [], [], [], []
         for record, new in zip(records, references, strict=True):
             image_rows.append({"reference_key": record.key, "data": new.image})
             features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
             if new.mask:
                 mask_rows.append({"reference_key": record.key, "data": new.mask})
+            if new.depth is not None:
+                depth_rows.append({"reference_key": record.key, "data": encode_depth_image(new.depth)})
             descriptor_rows += [rows.descriptor_row(record.key, *named) for named in new.descriptors.items()]
         with self.changing() as connection:
             generation = queries.begin_change(connection, scene_key, len(records))
@@ -213,6 +216,8 @@ class Store(StoreReader):
             connection.execute(insert(tables.features), features_rows)
             if mask_rows:
                 connection.execute(insert(tables.mask), mask_rows)
+            if depth_rows:
+                connection.execute(insert(tables.depth), depth_rows)
             if descriptor_rows:
                 connection.execute(insert(tables.global_descriptor), descriptor_rows)
         return records

@@ -16,7 +16,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 11
+SCHEMA_VERSION = 12
 
 metadata = MetaData()
 
@@ -77,6 +77,7 @@ reference = Table(
     # Of the scene when this reference was added or got its latest global descriptor.
     Column("generation", BigInteger, nullable=False, server_default=_NONE_YET),
     Column("mask_sha256", _Sha256),  # null without a mask
+    Column("depth_sha256", _Sha256),  # null without depth
     UniqueConstraint("scene_id", "reference_id"),
     Index("reference_by_generation", "scene_id", "generation"),
     Index("reference_by_image", "scene_id", "image_sha256"),
@@ -108,9 +109,10 @@ def _encoded(table: str, kind: str, length: int) -> Table:
     return Table(table, metadata, _reference_key(), kind_column, _bytes(), Column("sha256", _Sha256, nullable=False))
 
 
-# Images, masks and features have tables of their own, so that listing references does not read their bytes.
+# Images, masks, depth and features have tables of their own, so that listing references does not read their bytes.
 image = Table("image", metadata, _reference_key(), _bytes())
 mask = Table("mask", metadata, _reference_key(), _bytes())
+depth = Table("depth", metadata, _reference_key(), _bytes())  # see codec.py
 features = _encoded("features", "extractor", 128)
 global_descriptor = _encoded("global_descriptor", "name", 128)
 # Depth that is kept with references, see depths.py; which references are done is in reference_matching.

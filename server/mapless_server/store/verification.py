@@ -16,7 +16,7 @@ from . import codec, queries, rows
 from .database import is_damage, unless_damaged
 from .migrations import OLDEST_VERSION, read_version
 from .queries import is_detached
-from .tables import features, global_descriptor, image, mask, reference, scene
+from .tables import depth, features, global_descriptor, image, mask, reference, scene
 
 BLOBS_AT_A_TIME = 16
 """Images are megabytes each."""
@@ -26,6 +26,9 @@ PAGE_FAULTS_LISTED = 20
 
 Progress = Callable[[str, int, int], None]
 """Receives what is being done, how much of it is done, and how much there is."""
+
+FIRST_WITH_DEPTH = 12
+"""The schema that has depth."""
 
 _DATABASE = "database"
 
@@ -66,6 +69,9 @@ def verify(connection: Connection, on_progress: Progress = ignore_progress) -> V
     if version > OLDEST_VERSION:
         tables.append(mask)
         checks.append(_check_masks)
+    if version >= FIRST_WITH_DEPTH:
+        tables.append(depth)
+        checks.append(_check_depths)
     counts = {it.name: unless_damaged(connection, partial(_count, connection, it), lambda: 0) for it in tables}
     faults: list[str] = []
     for check in checks:
@@ -130,6 +136,21 @@ def _check_masks(connection: Connection, counts: dict[str, int], on_progress: Pr
             continue
         yield from _fault(name, "mask", rows.file, row, "mask")
     yield from _orphans(connection, mask)
+
+
+def _check_depths(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
+    column = reference.c
+    statement: Select[Any] = (
+        select(column.key, column.scene_id, column.reference_id, column.depth_sha256.label("sha256"), depth.c.data)
+        .outerjoin(depth, depth.c.reference_key == column.key)
+        .where(column.depth_sha256.is_not(None) | depth.c.data.is_not(None))
+    )
+    for name, row in _stream(connection, statement, "depths", counts[depth.name], on_progress):
+        if row is None:
+            yield f"{name}: depth, on damaged pages"
+            continue
+        yield from _fault(name, "depth", rows.depth_image, row, "depth")
+    yield from _orphans(connection, depth)
 
 
 def _check_features(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:

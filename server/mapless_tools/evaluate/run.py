@@ -72,7 +72,8 @@ def store_references(client: Client, scene: str, references: Sequence[Frame], pr
     """Creates a scene with these references."""
     client.create_scene(scene)
     new = (
-        NewReference(f.name, f.image_path, f.camera, f.world_from_camera, f.mask_path, f.provenance) for f in references
+        NewReference(f.name, f.image_path, f.camera, f.world_from_camera, f.mask_path, f.provenance, f.read_depth())
+        for f in references
     )
     total = len(references)
     progress("storing references", 0, total)

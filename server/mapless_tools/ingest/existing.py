@@ -24,6 +24,7 @@ class Stored:
     camera: Camera
     world_from_camera: RigidTransform
     mask_sha256: str = ""
+    depth_sha256: str = ""
 
 
 Identity = Stored | Reference
@@ -62,6 +63,7 @@ class KnownReferences:
         self._by_image.setdefault(stored.image_sha256, stored)
 
 
+_WITH_DEPTH = {False: "it has no depth", True: "it has depth"}
 _MASKED = {False: "it has no mask", True: "it has a mask"}
 
 
@@ -71,6 +73,9 @@ def difference(there: Identity, new: Stored) -> str:
         return "its image differs"
     if there.mask_sha256 != new.mask_sha256:
         return "its mask differs" if there.mask_sha256 and new.mask_sha256 else _MASKED[bool(there.mask_sha256)]
+    if there.depth_sha256 != new.depth_sha256:
+        is_both = there.depth_sha256 and new.depth_sha256
+        return "its depth differs" if is_both else _WITH_DEPTH[bool(there.depth_sha256)]
     return _camera_difference(there.camera, new.camera) or _pose_difference(
         there.world_from_camera, new.world_from_camera
     )

@@ -4,14 +4,17 @@ It can also rescue a damaged store: undamaged references are written.
 """
 
 from pathlib import Path
+from typing import Any
 
-from mapless import Client, Reference
+from mapless import Client, DepthImage, Reference
 from mapless.masks import FOLDER as MASKS
 from mapless.masks import mask_name
 from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 
 from .fetching import Export, fetch_all
+from .formats.depths import FOLDER as DEPTHS
+from .formats.depths import confidence_name, depth_entry, depth_name
 from .formats.writing import LAYOUTS, PosedImage, image_name
 
 FORMATS = (*LAYOUTS, "gltf")
@@ -31,8 +34,9 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
     """Writes a scene's references into a folder, except damaged ones.
 
     ValueError as in `check_target`, or without references. The layouts `cameras` and `kapture` also have the scene's
-    datum, down and unit. Masks are written to masks/, under COLMAP's names. A calibration is not
-    exported, since it holds for this server version only; a backup keeps it.
+    datum, down and unit. Masks are written to masks/, under COLMAP's names, and depths to depth/, which the layout
+    `cameras` alone describes. A calibration is not exported, since it holds for this server version only; a backup
+    keeps it.
 
     The description is written last, so a folder without it is an interrupted export. If every reference is damaged,
     nothing is left in the folder.
@@ -48,16 +52,12 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
     def take(reference: Reference) -> PosedImage:
         image = reference.image or b""
         name = image_name(reference.reference_id, image)
-        place.mkdir(parents=True, exist_ok=True)
-        with whole_file(place / name) as file:
-            file.write_bytes(image)
+        _write(place / name, image)
         if reference.mask is not None:
-            mask = folder / MASKS / mask_name(name)
-            mask.parent.mkdir(parents=True, exist_ok=True)
-            with whole_file(mask) as file:
-                file.write_bytes(reference.mask)
+            _write(folder / MASKS / mask_name(name), reference.mask)
+        depth = {} if reference.depth is None else _write_depth(folder / DEPTHS, name, reference.depth)
         has_mask = reference.mask is not None
-        return PosedImage(name, reference.camera, reference.world_from_camera, has_mask, reference.provenance)
+        return PosedImage(name, reference.camera, reference.world_from_camera, has_mask, reference.provenance, depth)
 
     known = client.get_scene(scene)
     images, damaged = fetch_all(client, scene, take, progress)
@@ -67,3 +67,18 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
             with whole_file(folder / path) as file:
                 file.write_text(text, encoding="utf-8")
     return Export(len(images), damaged)
+
+
+def _write_depth(folder: Path, image: str, depth: DepthImage) -> dict[str, Any]:
+    """Writes the depth of an image; returns its entries in `cameras.json`."""
+    name = depth_name(image, depth)
+    _write(folder / name, depth.data)
+    if depth.confidence:
+        _write(folder / confidence_name(name), depth.confidence)
+    return depth_entry(depth, name)
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as file:
+        file.write_bytes(data)

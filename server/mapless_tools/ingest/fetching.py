@@ -56,6 +56,8 @@ def fetch_all(
             return None, f"reference {reference.reference_id!r}: the image received is not the one that was stored"
         if with_image and reference.mask_sha256 and not _is_mask_of(reference):
             return None, f"reference {reference.reference_id!r}: the mask received is not the one that was stored"
+        if with_image and reference.depth_sha256 and not _is_depth_of(reference):
+            return None, f"reference {reference.reference_id!r}: the depth received is not the one that was stored"
         return take(reference), ""
 
     progress("references", 0, len(references))
@@ -76,6 +78,10 @@ def fetch_all(
 
 def _is_mask_of(reference: Reference) -> bool:
     return hashlib.sha256(reference.mask or b"").hexdigest() == reference.mask_sha256
+
+
+def _is_depth_of(reference: Reference) -> bool:
+    return reference.depth is not None and reference.depth.sha256 == reference.depth_sha256
 
 
 def _reference_ids(client: Client, scene: str) -> list[str]:

@@ -16,10 +16,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
-from mapless import Client, NewReference, errors
+from mapless import Client, DepthImage, NewReference, errors
+from mapless.depth import depth_from_message, depth_to_message
+from mapless.wire import FieldError
 from mapless_server.errors import InvalidArgument as BadImage
-from mapless_server.images import ANY_SIZE, ImageLimits, check_mask, image_size
-from mapless_tools.dataset import Frame, Refusal
+from mapless_server.images import ANY_SIZE, ImageLimits, check_depth, check_mask, image_size
+from mapless_tools.dataset import DepthFile, Frame, Refusal
 from mapless_tools.progress import Progress
 
 from .existing import Identity, KnownReferences, Stored, difference
@@ -166,7 +168,7 @@ class Uploader:
 
 
 def read_item(frame: Frame, limits: ImageLimits = ANY_SIZE) -> Item:
-    """Reads a frame's image and mask; ValueError if they cannot be a photograph of the frame's camera and its mask."""
+    """Reads a frame's image, mask and depth; ValueError if they cannot be a photograph of its camera and its parts."""
     camera = frame.camera
     with _named(frame.image_path):
         image = frame.image_path.read_bytes()
@@ -181,8 +183,22 @@ def read_item(frame: Frame, limits: ImageLimits = ANY_SIZE) -> Item:
             mask = frame.mask_path.read_bytes()
             check_mask(mask, (width, height), limits)
     digests = [hashlib.sha256(it).hexdigest() if it else "" for it in (image, mask)]
-    new = NewReference(frame.name, image, camera, frame.world_from_camera, mask, frame.provenance)
-    return new, Stored(frame.name, digests[0], camera, frame.world_from_camera, digests[1])
+    depth = None if frame.depth is None else _read_depth(frame.depth, (width, height), limits)
+    new = NewReference(frame.name, image, camera, frame.world_from_camera, mask, frame.provenance, depth)
+    depth_sha256 = "" if depth is None else depth.sha256
+    return new, Stored(frame.name, digests[0], camera, frame.world_from_camera, digests[1], depth_sha256)
+
+
+def _read_depth(file: DepthFile, size: tuple[int, int], limits: ImageLimits) -> DepthImage:
+    """Reads a depth as a server gets it; ValueError names the file."""
+    with _named(file.path):
+        depth = file.read()
+        try:
+            sent = depth_from_message(depth_to_message(depth), "depth")
+        except FieldError as error:
+            raise ValueError(f"{file.path}: {error}") from None
+        check_depth(sent, size, limits)
+        return sent
 
 
 @contextmanager

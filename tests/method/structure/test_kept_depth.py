@@ -4,20 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support.scenes import SceneOptions, make_scene, random_for
 
 from mapless.geometry import Array
 from mapless_server.method.bundle.bundle import free_problem
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.features.tracks import Tracks
-from mapless_server.method.features.views import Features, KeptDepth, KeypointDepths, PosedView
+from mapless_server.method.features.views import DepthSource, Features, KeptDepth, KeypointDepths, PosedView
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pairs.correspond import Correspondences, Matcher
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.structure.kept_depth import with_kept_depths
-from mapless_server.method.structure.model import Structure
+from mapless_server.method.structure.model import ScaleSource, Structure
 from mapless_server.method.structure.structure import StructureOptions, triangulated_structure
 
 SCENE = make_scene(random_for("kept depth"), SceneOptions(point_count=500, reference_count=3, baseline_m=0.8))
@@ -33,12 +34,19 @@ def true_depth(index: int) -> Array:
     return np.where(points >= 0, depth, np.nan)
 
 
-def with_depths(index: int, noise: float = SIGMA, seed: int = 0, factor: float = 1.0) -> PosedView:
+def keypoint_depths(depth: NDArray[np.floating], sigma: float) -> KeypointDepths:
+    """Depths of a network, which share a factor as wrong as each of them is."""
+    return KeypointDepths(depth.astype(np.float32), np.full(len(depth), sigma, np.float32), sigma)
+
+
+def with_depths(
+    index: int, noise: float = SIGMA, seed: int = 0, factor: float = 1.0, source: DepthSource = DepthSource.NETWORK
+) -> PosedView:
     """A reference with its true depths, each with an error."""
     depth = true_depth(index)
     error = np.random.default_rng(seed).normal(0.0, noise, len(depth)) if noise else 0.0
-    depths = KeypointDepths((factor * depth * np.exp(error)).astype(np.float32), max(noise, 1e-3))
-    return replace(SCENE.references[index], depths=depths)
+    depths = keypoint_depths(factor * depth * np.exp(error), max(noise, 1e-3))
+    return replace(SCENE.references[index], depths=replace(depths, source=source))
 
 
 def matched(references: tuple[PosedView, ...]) -> tuple[Structure, Correspondences]:
@@ -92,7 +100,7 @@ def test_a_factor_common_to_all_depths_is_removed(factor: float) -> None:
     assert reference.depths is not None
     depth = reference.depths.depth.copy()
     depth[::10] *= 1.5
-    references = (replace(reference, depths=KeypointDepths(depth, SIGMA)), *SCENE.references[1:])
+    references = (replace(reference, depths=keypoint_depths(depth, SIGMA)), *SCENE.references[1:])
     structure, correspondences = matched(references)
     kept = structure.tracks.select(np.arange(len(structure.x_in_world)) % 2 == 0)
     half = replace(structure, x_in_world=structure.x_in_world[::2], tracks=kept)
@@ -116,6 +124,38 @@ def test_where_triangulated_points_suffice_depths_change_nothing() -> None:
     assert all(isinstance(it, Localization) for it in poses)
     first, second = (it.world_from_camera.matrix() for it in poses if isinstance(it, Localization))
     np.testing.assert_array_equal(first, second)
+
+
+def test_measured_depths_are_used_beside_triangulated_points() -> None:
+    references = tuple(with_depths(i) for i in range(3))
+    measured = tuple(with_depths(i, source=DepthSource.MEASURED) for i in range(3))
+    structure, correspondences = matched(measured)
+    assert with_kept_depths(structure, references, correspondences) is structure
+    assert not with_kept_depths(structure, measured, correspondences).triangulated.all()
+
+
+def test_what_depths_share_is_in_the_covariance() -> None:
+    """Every depth of two references is 5 % too long: the pose is off by as much as its covariance says of that."""
+    answers = {}
+    for factor in (1.0, 1.05):
+        references = []
+        for index in range(2):  # what only one of them shows
+            kept = np.flatnonzero(SCENE.reference_points[index] % 2 == index)
+            view = SCENE.references[index].view
+            arrays = view.features.keypoints[kept], view.features.descriptors[kept], view.features.sizes_px[kept]
+            depths = keypoint_depths((factor * true_depth(index))[kept], 0.002)
+            depths = replace(depths, common_sigma=0.05, source=DepthSource.MEASURED)
+            view = replace(view, features=Features(*arrays))
+            references.append(replace(SCENE.references[index], view=view, depths=depths))
+        outcome = localize(SCENE.query, references, Pipeline(), LocalizeOptions()).outcome
+        assert isinstance(outcome, Localization)
+        answers[factor] = outcome
+    moved = answers[1.05].world_from_camera.translation - answers[1.0].world_from_camera.translation
+    assert answers[1.0].covariance is not None
+    assert np.linalg.norm(moved) > 0.002
+    sigma = np.sqrt(np.diag(answers[1.0].covariance)[:3])
+    assert np.linalg.norm(moved) < 2 * np.linalg.norm(sigma)
+    assert np.linalg.norm(sigma) < 3 * np.linalg.norm(moved)
 
 
 def test_planes_are_in_the_normal_equations_as_in_the_cost() -> None:
@@ -144,7 +184,13 @@ def test_references_that_share_nothing_give_points_by_depth() -> None:
         assert depths is not None
         arrays = view.features.keypoints[kept], view.features.descriptors[kept], view.features.sizes_px[kept]
         view = replace(view, features=Features(*arrays))
-        parts.append(replace(reference, view=view, depths=replace(depths, depth=depths.depth[kept])))
+        parts.append(
+            replace(
+                reference,
+                view=view,
+                depths=keypoint_depths(depths.depth[kept], SIGMA),
+            )
+        )
     answers = {
         has_depths: localize(
             SCENE.query, [it if has_depths else replace(it, depths=None) for it in parts], Pipeline(), LocalizeOptions()
@@ -185,3 +231,21 @@ def test_a_map_of_another_size_than_its_camera_is_an_error() -> None:
         KeptDepth(SCENE.query.camera, np.ones((2, 2), np.float32), 0.02)
     with pytest.raises(ValueError, match="relative_sigma"):
         KeptDepth(SCENE.query.camera.resized(2, 2), np.ones((2, 2), np.float32), 0.0)
+
+
+@pytest.mark.parametrize("source", list(DepthSource))
+def test_one_reference_with_depths_is_enough(source: DepthSource) -> None:
+    reference = with_depths(0, noise=0.01)
+    assert reference.depths is not None
+    depths = replace(reference.depths, common_sigma=0.02, source=source)
+    answer = localize(SCENE.query, [replace(reference, depths=depths)], Pipeline(), LocalizeOptions())
+    outcome = answer.outcome
+    assert isinstance(outcome, Localization)
+    step = SCENE.world_from_query.translation - reference.world_from_camera.translation
+    assert np.linalg.norm(outcome.world_from_camera.translation - SCENE.world_from_query.translation) < 0.02
+    assert outcome.scale_source is {DepthSource.NETWORK: ScaleSource.NETWORK}.get(source, ScaleSource.DEPTH)
+    assert outcome.covariance is not None
+    along = step / np.linalg.norm(step)
+    assert along @ outcome.covariance[:3, :3] @ along > (0.02 * np.linalg.norm(step)) ** 2
+    without = localize(SCENE.query, [replace(reference, depths=None)], Pipeline(), LocalizeOptions()).outcome
+    assert not isinstance(without, Localization)

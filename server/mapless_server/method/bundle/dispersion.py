@@ -9,6 +9,8 @@ The answer's covariance is that of world_from_camera in ROS's order (see `optimi
                  scale, for poses that depend on the scale rather than on triangulated points: initial poses, and poses
                  from predicted points (`no_structure`). Otherwise the references' poses determine the scale, and their
                  errors are in the dispersion.
+    depths       sum of v v^T, v the motion of the pose by one standard deviation of the factor that all depths of a
+                 reference share, for points that have their depth from one (see `structure.kept_depth`).
     offset       o o^T, o the Gauss-Newton step from the pose to its optimum, for an initial pose that is answered as it
                  is.
 
@@ -51,7 +53,7 @@ they are; with the poses eliminated too, what is left says what the data and the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +66,7 @@ from ..optim.optimize import LEAST_DAMPING, cauchy_weight, take, world_jacobian
 from .bundle import BundleProblem
 from .estimate import SUPPORTING_SHARE, gap_ratio
 from .intrinsics import IntrinsicsEquations
-from .normal_equations import Bundle, EliminatedPoints, ViewColumns
+from .normal_equations import Bundle, EliminatedPoints, ViewColumns, forward
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,7 @@ class Dispersion:
         offset: (6,) the Gauss-Newton step from the pose to the optimum.
         gap: distance to the nearest reference that holds the pose, over the median depth of the points.
         intrinsics: evidence of the data about errors of the intrinsics; empty if the problem has not these unknowns.
+        depths: (K, 6) motion by one standard deviation of the factor that a reference's depths share; empty without.
     """
 
     references: Array
@@ -123,6 +126,7 @@ class Dispersion:
     offset: Array
     gap: float
     intrinsics: IntrinsicsEquations
+    depths: Array = field(default_factory=lambda: np.zeros((0, 6)))
 
     def covariance(self, region_factor: float) -> Array:
         """Covariance C_r + f^2 C_p (6, 6)."""
@@ -176,7 +180,8 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
         thinning * influences[:, 6:],
         world_jacobian(bundle.world_from_query) @ -solved[0, query, :-1],
     )
-    return Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0], _gap(seen, bundle), intrinsics)
+    depths = _by_depths(seen, to_pose, points)
+    return Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0], _gap(seen, bundle), intrinsics, depths)
 
 
 def dispersed_covariance(
@@ -190,9 +195,15 @@ def dispersed_covariance(
     covariance = grown * dispersion.covariance(options.region_factor)
     if is_offset:
         covariance = covariance + np.outer(dispersion.offset, dispersion.offset)
-    factor = np.repeat([options.position_factor, options.rotation_factor], 3)
-    to_world = factor[:, None] * world_jacobian(world_from_camera)
+    factor, jacobian = (
+        np.repeat([options.position_factor, options.rotation_factor], 3),
+        world_jacobian(world_from_camera),
+    )
+    to_world = factor[:, None] * jacobian
     covariance = to_world @ covariance @ to_world.T
+    if len(dispersion.depths):
+        by_depths = dispersion.depths @ jacobian.T
+        covariance = covariance + by_depths.T @ by_depths
     return np.asarray((covariance + covariance.T) / 2)
 
 
@@ -202,6 +213,19 @@ def scale_covariance(world_from_camera: RigidTransform, centroid: Array, relativ
     arm = world_from_camera.translation - centroid
     covariance[:3, :3] = relative_sigma**2 * np.outer(arm, arm)
     return covariance
+
+
+def _by_depths(seen: ViewColumns, to_pose: Array, points: EliminatedPoints) -> Array:
+    """Motions (K, 6) of the pose by the factors of the references' depths, one standard deviation of each; or none."""
+    planes = seen.planes
+    if planes is None:
+        return np.zeros((0, 6))
+    change = planes.normal.T * (planes.information * planes.common)  # of -h
+    eliminated, motions = np.stack(forward(points.factor, change)), []
+    for view in range(len(seen.parts) - 1):
+        of_view = np.where(planes.view == view, eliminated, 0.0).ravel()
+        motions.append(-to_pose @ (points.cross[: to_pose.shape[1]] @ of_view))
+    return np.array(motions)
 
 
 def _without_each(

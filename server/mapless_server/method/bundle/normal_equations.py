@@ -112,7 +112,7 @@ class ViewColumns:
         view_count: number of views.
         focal, offset: (2, O) as in `Observations`.
         by_intrinsics: (2, I, O_q) derivative of the last view's residuals by errors of its intrinsics, if unknown.
-        planes: planes of the points, if any have stored depths.
+        planes: planes of the points, if any have depths.
     """
 
     point: NDArray[np.intp]
@@ -260,9 +260,9 @@ class NormalEquations:
         damped = self.point_block.copy()
         damped[:3] *= 1 + damping
         factor = _cholesky(damped)
-        gradient = np.stack(_forward(factor, self.point_gradient))
+        gradient = np.stack(forward(factor, self.point_gradient))
         seen = self.columns
-        by_point = np.stack(_forward(take(factor, seen.point), np.swapaxes(self.by_point, 0, 1)), axis=1)
+        by_point = np.stack(forward(take(factor, seen.point), np.swapaxes(self.by_point, 0, 1)), axis=1)
         by_observation = np.einsum("kao,kbo->abo", self.weighted_pose, by_point).reshape(18, -1)
         by_view = np.zeros((len(seen.parts), 18, self.point_gradient.shape[1]))
         for cross, part in zip(by_view, seen.parts, strict=True):
@@ -326,7 +326,7 @@ def _cholesky(matrices: Array) -> Array:
     return np.concatenate([diagonal, [xy, xz, yz]])
 
 
-def _forward(factor: Array, vectors: Array) -> list[Array]:
+def forward(factor: Array, vectors: Array) -> list[Array]:
     """Solves L y = b for vectors b (3, ..., P); returns the components of y."""
     xx, yy, zz, xy, xz, yz = factor
     x = vectors[0] / xx

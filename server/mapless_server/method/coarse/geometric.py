@@ -1,8 +1,9 @@
 """The coarse stage without a network: the default on a machine without a GPU or weights.
 
-Features matched among the references are triangulated from the references' known poses, and the query is posed by PnP
-on its matches with these points. That is metric: `Variant.BEST` needs no further scale and structure. For the paper's
-variants the sparse points are scattered into point maps, in a local frame with a scale of its own, like a network's.
+Features matched among the references are triangulated from the references' known poses, or have depths, and the query
+is posed by PnP on its matches with these points. That is metric: `Variant.BEST` needs no further scale and structure.
+For the paper's variants the sparse points are scattered into point maps, in a local frame with a scale of its own, like
+a network's.
 """
 
 from collections.abc import Sequence
@@ -67,10 +68,11 @@ class GeometricReconstructor:
         references, correspondences = request.references, request.correspondences
         if correspondences is None:
             raise ValueError(f"{self.name} reconstructs from correspondences, and there are none")
-        if rejection := _check(references):
+        has_depths = any(it.depths is not None for it in references)
+        if not has_depths and (rejection := _check(references)):
             return rejection
         structure = triangulated_structure(references, correspondences, STRUCTURE)
-        if any(it.depths is not None for it in references):
+        if has_depths:
             structure = with_kept_depths(structure, references, correspondences)
         if not len(structure.x_in_world):
             message = "the references share no points that could be triangulated"

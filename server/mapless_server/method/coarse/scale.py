@@ -15,7 +15,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..features.tracks import keypoint_offsets
-from ..features.views import PosedView, Reconstruction
+from ..features.views import DepthSource, PosedView, Reconstruction
 from ..options import ScaleStrategy
 from ..pairs.correspond import Correspondences
 from ..pairs.epipolar import MIN_PARALLAX_DEG, triangulate_depths
@@ -110,6 +110,18 @@ def _is_first_better(first: float, second: float, of_first: float, of_second: fl
     return of_first < MAX_DEVIATION or of_first <= of_second or math.isnan(of_second)
 
 
+def depth_scale(reference: PosedView, world_from_query: RigidTransform) -> MetricScale | Rejection:
+    """The scale of a single reference with depths, which is metric already; NO_USABLE_REFERENCES if none is known."""
+    depths, pose = reference.depths, reference.world_from_camera
+    if depths is None or not np.isfinite(depths.depth).any():
+        message = "a single reference, and no depth is known at its keypoints"
+        return Rejection(RejectionReason.NO_USABLE_REFERENCES, message)
+    unit = float(np.nanmedian(depths.depth))
+    frame = Similarity(unit, pose.rotation, pose.translation)
+    is_measured = depths.source is DepthSource.MEASURED
+    return MetricScale(unit, ScaleStage.DEPTH, 0.0, 0, frame, world_from_query, depths.common_sigma, is_measured)
+
+
 def network_scale(reconstruction: Reconstruction, reference: PosedView) -> MetricScale | Rejection:
     """Returns the scale of a reconstruction from a single reference whose unit is approximately the metre.
 
@@ -145,16 +157,17 @@ def known_scale(
     """The scale of a reconstruction that was triangulated from the known poses, so that it is metric already.
 
     The structure has at least one point, and its tracks the references' order; the frame is `unit_frame`.
-    NO_USABLE_REFERENCES for fewer than two references, DEGENERATE_REFERENCES for references too close to one another.
+    Unless depths give points, NO_USABLE_REFERENCES for fewer than two references, DEGENERATE_REFERENCES for references
+    too close to one another.
     """
-    rejection = _check_references(references)
-    if rejection:
+    has_depths = structure.planes is not None
+    if not has_depths and (rejection := _check_references(references)):
         return rejection
     poses, tracks = [reference.world_from_camera for reference in references], structure.tracks
     centres, axes = np.stack([it.translation for it in poses]), np.stack([it.rotation[:, 2] for it in poses])
     depth_m = ((structure.x_in_world[tracks.point] - centres[tracks.view]) * axes[tracks.view]).sum(axis=1)
-    rejection = _check_depth(trajectory_radius(centres) / float(np.median(depth_m)), len(references))
-    if rejection:
+    share = trajectory_radius(centres) / float(np.median(depth_m))
+    if not has_depths and (rejection := _check_depth(share, len(references))):
         return rejection
     frame = unit_frame(poses[0], structure.x_in_world)
     stage = ScaleStage.TRAJECTORY if strategy is ScaleStrategy.TRAJECTORY else ScaleStage.TRIANGULATION

@@ -5,6 +5,7 @@ Images are reduced, and keypoints undistorted, here and nowhere else.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 
 import cv2
@@ -178,17 +179,28 @@ def grid_shape(camera: Camera, columns: int) -> tuple[int, int]:
     return max(1, round(columns * camera.height_px / camera.width_px)), columns
 
 
+class DepthSource(str, Enum):
+    """Where depths of a reference come from: predicted by a network, or measured by a sensor."""
+
+    NETWORK = "network"
+    MEASURED = "measured"
+
+
 @dataclass(frozen=True, eq=False)
 class KeypointDepths:
-    """Depths that are stored with a reference, at its keypoints.
+    """Depths at the keypoints of a reference, of any source.
 
     Attributes:
-        depth: (N,) float32, in the unit of its pose, along the viewing direction; NaN where nothing is kept.
-        relative_sigma: standard deviation of a depth, as a share of it, above 0.
+        depth: (N,) float32, in the unit of its pose, along the viewing direction; NaN where there is none.
+        relative_sigma: (N,) standard deviation of each depth, as a share of it, above 0.
+        common_sigma: standard deviation of the factor that all share, as a share.
+        source: where they come from.
     """
 
     depth: NDArray[np.float32]
-    relative_sigma: float
+    relative_sigma: NDArray[np.float32]
+    common_sigma: float
+    source: DepthSource = DepthSource.NETWORK
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +226,8 @@ class KeptDepth:
     def at_keypoints(self, view: View) -> KeypointDepths:
         """The depths at the keypoints of the reference, nearest neighbour."""
         rows, columns, inside = map_cells(self.camera, view.features.keypoints, view.camera)
-        return KeypointDepths(np.where(inside, self.depth[rows, columns], np.float32(np.nan)), self.relative_sigma)
+        depth, sigma = np.where(inside, self.depth[rows, columns], np.float32(np.nan)), self.relative_sigma
+        return KeypointDepths(depth, np.full(len(depth), sigma, np.float32), sigma)
 
 
 ReferenceErrors = Callable[[int, int], float | None]

@@ -1,14 +1,15 @@
-"""The pose from a single reference, with depths in metres that a network predicts.
+"""The pose from a single reference, with depths that a sensor measured or a network predicts.
 
 The matches with one reference determine the rotation and the direction of the step from one camera to the other; the
-length of the step follows from the predicted depths. Both are one problem of six unknowns: each match is a point at its
-predicted depth, whose error moves its projection along the epipolar line, so the covariance of a residual is
+length of the step follows from the depths. Both are one problem of six unknowns: each match is a point at its depth,
+whose error moves its projection along the epipolar line, so the covariance of a residual is
 
     sigma^2 I + s_d^2 j j^T,    j the derivative of the projection by the logarithm of the depth,
 
-where sigma and s_d, the errors of keypoints and of single depths, are estimated from the residuals. An error that all
-depths share, of the network's metre, changes no residual: it moves the camera along the step, and the covariance of the
-pose contains it as s^2 d d^T, with d the step and s its relative standard deviation.
+where sigma and s_d, the errors of keypoints and of single depths, are estimated from the residuals. Where these do not
+show the errors of depths, because the step is small, they are as stated. An error that all depths share, of the
+sensor's or the network's metre, changes no residual: it moves the camera along the step, and the covariance of the pose
+contains it as s^2 d d^T, with d the step and s its relative standard deviation.
 """
 
 from dataclasses import dataclass, replace
@@ -21,11 +22,11 @@ from mapless.geometry import Array, RigidTransform, normalize_jacobian
 from ..bundle.dispersion import scale_covariance
 from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from ..features.tracks import Tracks
-from ..features.views import Matches, PosedView, ReconstructedView, View
+from ..features.views import Matches, PosedView, View
 from ..optim.optimize import cauchy_weight, motion_jacobian, perturbed, solve_step, world_covariance
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..rejection import Rejection, RejectionReason
-from ..structure.model import MetricScale, PixelPoints, PointMatches, Structure
+from ..structure.model import PixelPoints, PointMatches, Structure
 from ..structure.observations import FIRST_GUESS
 from .pnp import PnpOptions, false_alarms, ransac
 
@@ -37,7 +38,7 @@ FIRST_SIGMA_PX, MIN_SIGMA_PX = 1.5, 0.5
 
 FIRST_DEPTH_SIGMA, MIN_DEPTH_SIGMA, MAX_DEPTH_SIGMA = 0.1, 0.01, 0.3
 """Initial, least and largest relative standard deviation of a depth; with a larger one nearly every match would be an
-inlier along its epipolar line."""
+inlier along its epipolar line. The first is also that of a network, which does not state its own."""
 
 INLIER_SIGMA = 3.0
 """Largest residual of an inlier, in standard deviations."""
@@ -56,11 +57,26 @@ ROTATION_FACTOR = 1.79
 
 
 @dataclass(frozen=True, eq=False)
+class MatchedDepths:
+    """Depths of the keypoints of a reference that M matches have.
+
+    Attributes:
+        depth: (M,) in the unit of the reference's pose; NaN where unknown.
+        sigma: relative standard deviation of a depth.
+        common_sigma: relative standard deviation of the factor that they share.
+    """
+
+    depth: Array
+    sigma: float
+    common_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
 class Found:
     """A pose from one reference.
 
     Attributes:
-        support: support with the estimate; its points have their predicted depths.
+        support: support with the estimate; its points have their depths.
         score: the larger, the less likely are so many inliers among wrong matches.
         moved_score: the same for those matches that are at other pixels than in the reference; see `judge.references`.
     """
@@ -74,33 +90,32 @@ def solve_one_reference(
     query: View,
     reference: PosedView,
     matches: Matches,
-    predicted: ReconstructedView,
-    scale: MetricScale,
+    depths: MatchedDepths,
+    initial: RigidTransform | None,
     origin: Array,
     stationary: StationaryOptions,
 ) -> Found | Rejection:
-    """Estimates the pose of a query from its matches with a single reference.
+    """Estimates the pose of a query from its matches (M, 2) with a single reference.
 
-    TOO_FEW_MATCHES or PNP_FAILED if there is none. `predicted` has the reference's depths; the scale is metres per unit
-    of these, with the relative standard deviation; `origin` (3,) is that of the reference's world in the caller's
-    world; `stationary` says what is at the same pixels.
+    TOO_FEW_MATCHES or PNP_FAILED if there is none. `initial` is a pose to begin with; `origin` (3,) is that of the
+    reference's world in the caller's world; `stationary` says what is at the same pixels.
     """
-    points = _points(reference, predicted, scale, matches)
+    points = _points(reference, depths.depth, matches)
     known = np.isfinite(points).all(axis=1)
     matches, points = matches[known], points[known]
     if len(matches) < MIN_INLIERS:
-        message = f"{len(matches)} matches with a predicted depth, {MIN_INLIERS} needed with one reference"
+        message = f"{len(matches)} matches with a depth, {MIN_INLIERS} needed with one reference"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
     seen = PixelPoints(query.camera, points, query.features.pixels(matches[:, 0]))
-    problem = _Problem(seen, reference.world_from_camera.translation)
-    solved = _solve(problem, scale.world_from_query)
-    count = int(solved.inliers.sum())
-    if count < MIN_INLIERS:
+    problem = _Problem(seen, reference.world_from_camera.translation, depths.sigma)
+    solved = _solve(problem, initial)
+    count = 0 if solved is None else int(solved.inliers.sum())
+    if solved is None or count < MIN_INLIERS:
         message = f"no pose explains more than {count} of {len(matches)} matches, {MIN_INLIERS} needed"
         return Rejection(RejectionReason.PNP_FAILED, message)
     pose = solved.world_from_camera
     covariance = _covariance(problem, solved)
-    covariance += scale_covariance(pose, reference.world_from_camera.translation, scale.relative_sigma)
+    covariance += scale_covariance(pose, reference.world_from_camera.translation, depths.common_sigma)
     estimate = PoseEstimate(pose, PoseStage.REFINED, solved.inliers, solved.errors_px, covariance)
     rows = np.arange(len(points))
     structure = Structure(
@@ -109,7 +124,7 @@ def solve_one_reference(
         replace(FIRST_GUESS, level_px=solved.sigma_px),
     )
     found = PointMatches(rows, matches[:, 0].astype(np.intp), np.zeros(len(rows), bool), 0.0)
-    support = PosedSupport(query, (reference,), structure, found, origin, estimate=estimate)
+    support = PosedSupport(query, (reference,), structure, found, origin, (matches,), estimate=estimate)
     moved = are_moved(query, reference, matches, matches, stationary)
     some = replace(solved, inliers=solved.inliers[moved], errors_px=solved.errors_px[moved])
     moved_score = score_of(replace(problem, seen=problem.seen[moved]), some)
@@ -118,10 +133,11 @@ def solve_one_reference(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Points at predicted depths that the query sees, and the reference's centre (3,)."""
+    """Points at their depths that the query sees, the reference's centre (3,), and the stated error of a depth."""
 
     seen: PixelPoints
     reference_centre: Array
+    depth_sigma: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,12 +167,9 @@ class _Rows:
         return np.asarray((np.eye(2) - share) / sigma_px**2)
 
 
-def _points(reference: PosedView, predicted: ReconstructedView, scale: MetricScale, matches: Matches) -> Array:
-    """Points (M, 3) in the world at the predicted depths of the reference's keypoints; NaN without a depth."""
-    camera = reference.view.camera
-    pixels = reference.view.features.pixels(matches[:, 1])
-    depth = scale.metres_per_unit * predicted.depth_at(pixels, camera)
-    rays = camera.rays(pixels)
+def _points(reference: PosedView, depth: Array, matches: Matches) -> Array:
+    """Points (M, 3) in the world at the depths (M,) of the reference's keypoints; NaN without a depth."""
+    rays = reference.view.camera.rays(reference.view.features.pixels(matches[:, 1]))
     points = rays / rays[:, 2:] * np.where(depth > 0, depth, np.nan)[:, None]
     return np.asarray(reference.world_from_camera.apply(points))
 
@@ -181,15 +194,16 @@ def _distances(rows: _Rows, sigma_px: float, depth_sigma: float) -> Array:
     return np.asarray(np.where(rows.in_front, np.sqrt(np.maximum(squared, 0)), np.inf))
 
 
-def _solve(problem: _Problem, initial: RigidTransform) -> _Solved:
-    """Refines the candidate with the most inliers: the network's own pose, or one of RANSAC at two thresholds."""
+def _solve(problem: _Problem, initial: RigidTransform | None) -> _Solved | None:
+    """Refines the candidate with the most inliers: the given pose, or one of RANSAC at two thresholds."""
 
     def inlier_count(pose: RigidTransform) -> int:
         distance = _distances(_linearize(problem, pose), FIRST_SIGMA_PX, FIRST_DEPTH_SIGMA)
         return int((distance < INLIER_SIGMA).sum())
 
     found = [ransac(problem.seen, initial, PnpOptions(inlier_px=inlier_px)) for inlier_px in (4.0, 16.0)]
-    return _refine(problem, max([initial, *(pose for pose in found if pose)], key=inlier_count))
+    candidates = [pose for pose in (initial, *found) if pose]
+    return _refine(problem, max(candidates, key=inlier_count)) if candidates else None
 
 
 def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
@@ -210,12 +224,12 @@ def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
         pose = perturbed(pose.inverse(), step).inverse()
         inliers = distance < INLIER_SIGMA
         if iteration >= 2 and inliers.sum() >= MIN_INLIERS:
-            sigma_px, depth_sigma = _noise(_linearize(problem, pose), inliers)
+            sigma_px, depth_sigma = _noise(_linearize(problem, pose), inliers, problem.depth_sigma)
     distance = _distances(_linearize(problem, pose), sigma_px, depth_sigma)
     return _Solved(pose, distance < INLIER_SIGMA, distance * sigma_px, sigma_px, depth_sigma)
 
 
-def _noise(rows: _Rows, inliers: NDArray[np.bool_]) -> tuple[float, float]:
+def _noise(rows: _Rows, inliers: NDArray[np.bool_], stated_sigma: float) -> tuple[float, float]:
     """Standard deviations of keypoints across the epipolar lines, and of depths along them."""
     residual, by_depth = rows.residual[inliers], rows.by_depth[inliers]
     length = np.linalg.norm(by_depth, axis=1)
@@ -225,7 +239,7 @@ def _noise(rows: _Rows, inliers: NDArray[np.bool_]) -> tuple[float, float]:
     # Errors of depth show only where they move a projection by more than a keypoint errs.
     shows = length * MAX_DEPTH_SIGMA > INLIER_SIGMA * sigma_px
     if shows.sum() < MIN_INLIERS:
-        return sigma_px, FIRST_DEPTH_SIGMA
+        return sigma_px, float(np.clip(stated_sigma, MIN_DEPTH_SIGMA, MAX_DEPTH_SIGMA))
     along = (direction * residual).sum(axis=1)[shows]
     spread = MAD_TO_SIGMA * float(np.median(np.abs(along / length[shows])))
     from_pixels = float(np.median(sigma_px / length[shows]))

@@ -1,17 +1,19 @@
-"""Depths stored with the references: points where nothing can be triangulated.
+"""Depths of the references: points where nothing can be triangulated.
 
-A network has predicted the depth of each reference once, when it was added (see `scenes.depth`). A keypoint with depth
-d and relative standard deviation s, of a camera at C with the viewing direction z, then has its point near the plane
+A sensor has measured the depth of a reference (see `measured_depth`), or a network has predicted it once, when it was
+added (see `scenes.depth`). A keypoint with depth d and relative standard deviation s, of a camera at C with the viewing
+direction z, then has its point near the plane
 
     z . (x - C) = d,    with the standard deviation    s d.
 
 A reference's keypoint that only the query matches becomes a point at its depth, which one reference observes. Its error
 is along the ray; the final adjustment keeps the planes (see `bundle`). Where the photograph matches mostly triangulated
-points, these alone are used.
+points, these alone are used instead of a network's depths.
 
-A network's errors are shared by all depths of a photograph. What they share is seen at the keypoints of triangulated
-points: the most probable common factor is removed, by the variances of depths and points, with Cauchy's loss and a
-prior of standard deviation s. Points that are triangulated stay where they are.
+A factor is common to all depths of a photograph: the error of a sensor's scale, or of a network. It is seen at the
+keypoints of triangulated points: the most probable one is removed, by the variances of depths and points, with Cauchy's
+loss and a prior of its standard deviation. What is left of it moves all planes of a reference together, which the
+pose's covariance contains (see `bundle.dispersion`). Points that are triangulated stay where they are.
 """
 
 from collections.abc import Sequence
@@ -23,7 +25,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from ..features.tracks import Tracks, keypoint_offsets
-from ..features.views import PosedView
+from ..features.views import DepthSource, PosedView
 from ..optim.optimize import cauchy_weight
 from ..pairs.correspond import Correspondences
 from .match import vote
@@ -41,7 +43,7 @@ def with_kept_depths(
     correspondences: Correspondences,
     min_added_share: float = MIN_ADDED_SHARE,
 ) -> Structure:
-    """Adds the points that stored depths give to a structure, after the triangulated ones, with its `planes`.
+    """Adds the points that depths give to a structure, after the triangulated ones, with its `planes`.
 
     Each is of a reference's keypoint that the query matches and that observes no triangulated point. The references
     are in the order of the structure's tracks; the correspondences are those of the query with each. The structure,
@@ -50,6 +52,8 @@ def with_kept_depths(
     known = _KnownDepths.of(references)
     rows = _single_rows(structure, correspondences, known)
     counts = [len(reference.view.features) for reference in references]
+    if any(it.depths is not None and it.depths.source is DepthSource.MEASURED for it in references):
+        min_added_share = 0.0
     if not len(rows) or len(rows) < min_added_share * len(vote(structure, counts, correspondences)):
         return structure
     return _with_single(structure, _without_common_factors(structure, references, known), rows)
@@ -63,6 +67,7 @@ class _KnownDepths:
         offsets: (K + 1,) of each reference's keypoints.
         centre, ray, axis: (N, 3) camera centre, viewing ray of depth 1 and viewing direction, world.
         depth, sigma: (N,) depth and standard deviation in the unit of the poses; NaN where unknown.
+        factor_sigma: (K,) standard deviation of the factor that the depths of each reference share.
     """
 
     offsets: NDArray[np.intp]
@@ -71,29 +76,34 @@ class _KnownDepths:
     axis: Array
     depth: Array
     sigma: Array
+    factor_sigma: Array
 
     @staticmethod
     def of(references: Sequence[PosedView]) -> "_KnownDepths":
         offsets = keypoint_offsets(references)
         counts = np.diff(offsets)
-        depth, sigma = np.full(offsets[-1], np.nan), np.full(offsets[-1], np.nan)
-        for reference, start, end in zip(references, offsets[:-1], offsets[1:], strict=True):
+        depth, sigma, factor_sigma = np.full(offsets[-1], np.nan), np.full(offsets[-1], np.nan), np.zeros(len(counts))
+        for index, (reference, start, end) in enumerate(zip(references, offsets[:-1], offsets[1:], strict=True)):
             if reference.depths is not None:
+                factor_sigma[index] = reference.depths.common_sigma
                 depth[start:end] = reference.depths.depth
                 sigma[start:end] = reference.depths.depth * reference.depths.relative_sigma
         axis = np.repeat([it.world_from_camera.rotation[:, 2] for it in references], counts, axis=0)
-        return _KnownDepths(offsets, *keypoint_rays(references), axis, depth, sigma)
+        return _KnownDepths(offsets, *keypoint_rays(references), axis, depth, sigma, factor_sigma)
 
     def planes(self, rows: NDArray[np.intp]) -> DepthPlanes:
         """Planes of the points that these keypoints show; all must have a depth."""
         normal = self.axis[rows]
         offset = (normal * self.centre[rows]).sum(axis=1) + self.depth[rows]
-        return DepthPlanes(normal, offset, self.sigma[rows] ** -2.0)
+        view = np.searchsorted(self.offsets, rows, side="right") - 1
+        common = self.factor_sigma[view] * self.depth[rows]
+        return DepthPlanes(normal, offset, self.sigma[rows] ** -2.0, view, common)
 
 
 def _without_common_factors(structure: Structure, references: Sequence[PosedView], known: _KnownDepths) -> _KnownDepths:
     """Divides the depths of each reference by the factor that triangulated points say they share."""
     tracks, depth, sigma = structure.tracks, known.depth.copy(), known.sigma.copy()
+    factor_sigma = known.factor_sigma.copy()
     row = known.offsets[tracks.view] + tracks.keypoint
     has_depth = np.isfinite(known.depth[row])
     if not has_depth.any():
@@ -108,17 +118,20 @@ def _without_common_factors(structure: Structure, references: Sequence[PosedView
         seen = has_depth & (tracks.view == view)
         if reference.depths is None or not seen.any():
             continue
-        own_variance = reference.depths.relative_sigma**2
+        prior_information = reference.depths.common_sigma**-2
+        own_variance = reference.depths.relative_sigma[tracks.keypoint[seen]].astype(np.float64) ** 2
         values, variance, common = log_factor[seen], own_variance + relative_variance[seen], 0.0
         for _ in range(ITERATIONS):
             # Depths are wrong at edges, and of what is reflected.
             squared = (values - common) ** 2 / variance
             weight = cauchy_weight(squared, StructureOptions.loss_scale_sigma) / variance
-            common = float(weight @ values) / (float(weight.sum()) + 1 / own_variance)
+            information = float(weight.sum()) + prior_information
+            common = float(weight @ values) / information
         its_rows = slice(known.offsets[view], known.offsets[view + 1])
         depth[its_rows] /= np.exp(common)
         sigma[its_rows] /= np.exp(common)
-    return replace(known, depth=depth, sigma=sigma)
+        factor_sigma[view] = information**-0.5
+    return replace(known, depth=depth, sigma=sigma, factor_sigma=factor_sigma)
 
 
 def _single_rows(structure: Structure, correspondences: Correspondences, known: _KnownDepths) -> NDArray[np.intp]:

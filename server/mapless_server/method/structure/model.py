@@ -29,6 +29,8 @@ class ScaleStage(str, Enum):
     TRAJECTORY = "trajectory"
     NETWORK = "network"
     """The network's own metres, with a single reference."""
+    DEPTH = "depth"
+    """The measured or kept depth of a single reference."""
 
 
 class ScaleSource(str, Enum):
@@ -38,6 +40,8 @@ class ScaleSource(str, Enum):
     """The references' given poses."""
     NETWORK = "network"
     """The metres that a network predicts, with a single reference."""
+    DEPTH = "depth"
+    """The depth that a sensor measured with a single reference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +55,8 @@ class MetricScale:
         anchor: index of the reference whose pose ties the local frame to the world.
         world_from_local: the reconstruction's frame in the world, metres.
         world_from_query: the query camera's initial pose P_q^init, metres.
-        relative_sigma: standard deviation of the network's metre, if that gives the scale; otherwise 0.
+        relative_sigma: standard deviation of the depths' common factor, if they give the scale; otherwise 0.
+        is_measured: whether a sensor measured the depths that give the scale.
     """
 
     metres_per_unit: float
@@ -61,39 +66,54 @@ class MetricScale:
     world_from_local: Similarity
     world_from_query: RigidTransform
     relative_sigma: float = 0.0
+    is_measured: bool = False
 
     @property
     def source(self) -> ScaleSource:
         """The basis of the scale."""
-        return ScaleSource.NETWORK if self.stage is ScaleStage.NETWORK else ScaleSource.REFERENCES
+        if self.is_measured:
+            return ScaleSource.DEPTH
+        return ScaleSource.NETWORK if self.is_from_depth else ScaleSource.REFERENCES
+
+    @property
+    def is_from_depth(self) -> bool:
+        """Whether the depths of a single reference give it."""
+        return self.stage in (ScaleStage.NETWORK, ScaleStage.DEPTH)
 
 
 @dataclass(frozen=True, eq=False)
 class DepthPlanes:
-    """Planes from stored depths: each of P points is near a plane, normal . x = offset.
+    """Planes from depths: each of P points is near a plane, normal . x = offset.
 
     Attributes:
         normal: (P, 3) unit vectors, world.
         offset: (P,) metres.
         information: (P,) inverse variance of the distance from the plane; 0 if unknown.
+        view: (P,) the reference whose depth it is.
+        common: (P,) change of the offset by one standard deviation of the factor that all depths of the reference
+            share, metres.
     """
 
     normal: Array
     offset: Array
     information: Array
+    view: NDArray[np.intp]
+    common: Array
 
     def __getitem__(self, points: NDArray[np.bool_] | NDArray[np.intp]) -> DepthPlanes:
-        return DepthPlanes(self.normal[points], self.offset[points], self.information[points])
+        columns = self.offset[points], self.information[points], self.view[points], self.common[points]
+        return DepthPlanes(self.normal[points], *columns)
 
     @staticmethod
     def unknown(count: int) -> DepthPlanes:
         """Planes of points that are near none."""
-        return DepthPlanes(np.zeros((count, 3)), np.zeros(count), np.zeros(count))
+        nothing = np.zeros(count)
+        return DepthPlanes(np.zeros((count, 3)), nothing, nothing, np.zeros(count, np.intp), nothing)
 
     def and_last(self, others: DepthPlanes) -> DepthPlanes:
         """Appends the planes of further points."""
-        pairs = ((getattr(self, name), getattr(others, name)) for name in ("normal", "offset", "information"))
-        return DepthPlanes(*map(np.concatenate, pairs))
+        names = ("normal", "offset", "information", "view", "common")
+        return DepthPlanes(*(np.concatenate([getattr(self, it), getattr(others, it)]) for it in names))
 
     def cost(self, x_in_world: Array) -> float:
         """Sum over the points (P, 3) of their squared distances, in standard deviations."""
@@ -112,7 +132,7 @@ class Structure:
         x_in_world: (P, 3) metres.
         tracks: observations of these points by the references, in the order of the points.
         noise: noise of the keypoints, estimated from the residuals.
-        planes: planes of the points, if references have stored depths; points that a single reference observes are
+        planes: planes of the points, if references have depths; points that a single reference observes are
             last.
     """
 

@@ -16,6 +16,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 
 from mapless import names, wire
+from mapless.depth import depth_from_message
 from mapless.geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, GeoPosition, world_from_enu_at, world_from_geodetic
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera
 from mapless.lenses import lens_model_of
@@ -24,7 +25,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, camera_from_message, joined, transform_from_message, vector_from_message
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
-from mapless_server.images import ImageLimits, check_mask, image_size
+from mapless_server.images import ImageLimits, check_depth, check_mask, image_size
 from mapless_server.images.exif import read_exif
 from mapless_server.method.bundle.priors import (
     NO_PRIORS,
@@ -152,6 +153,19 @@ def _mask_of(message: Any, path: str, camera: Camera, limits: ImageLimits) -> by
     mask: bytes = message.mask
     check_mask(mask, (camera.width_px, camera.height_px), limits, joined(path, "mask"))
     return mask
+
+
+def with_depth(photo: Photo, message: Any, path: str, limits: ImageLimits) -> Photo:
+    """The photograph with the depth of its message, if there is one; reads only its header.
+
+    FieldError if a number is wrong; InvalidArgument if the bytes are refused by their header.
+    """
+    if not message.HasField("depth"):
+        return photo
+    field, size = joined(path, "depth"), (photo.camera.width_px, photo.camera.height_px)
+    depth = depth_from_message(message.depth, field)
+    check_depth(depth, size, limits, field)
+    return replace(photo, depth=depth)
 
 
 MIN_SEEN_SHARE = 0.1

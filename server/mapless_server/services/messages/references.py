@@ -82,6 +82,7 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
         feature_count=reference.feature_count,
         mask_sha256=reference.mask_sha256,
         provenance=provenance_to_message(reference.provenance),
+        depth_sha256=reference.depth_sha256,
     )
     message.create_time.FromDatetime(reference.create_time)
     return message
@@ -114,6 +115,21 @@ def nearly_ignored(shares: Mapping[str, float]) -> list[str]:
         f"the mask of reference {first!r} ignores {100 * share:.0f} % of its image{others}: 0 means ignore, every "
         "other value use; is it inverted?"
     ]
+
+
+def implausible_depths(medians: Mapping[str, float | None]) -> list[str]:
+    """Warning about new references whose median depth is that of another unit; or none."""
+    least, most = PLAUSIBLE_DEPTHS
+    wrong = {name: depth for name, depth in medians.items() if depth is not None and not least <= depth <= most}
+    if not wrong:
+        return []
+    first, depth = next(iter(wrong.items()))
+    others = f", and those of {len(wrong) - 1} more are as far" if len(wrong) > 1 else ""
+    return [f"the median depth of reference {first!r} is {depth:.3g}{others}: is unit_m right, 0.001 for millimetres?"]
+
+
+PLAUSIBLE_DEPTHS = 0.05, 200.0
+"""Median depths of sensors, metres; other units differ by a thousand."""
 
 
 def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesResponse:

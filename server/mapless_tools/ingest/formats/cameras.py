@@ -4,10 +4,10 @@
 ``K`` (3x3, pixels, (0, 0) the centre of the top-left one), ``dist`` (OpenCV's k1 k2 p1 p2 [k3], or null) and
 ``world_from_camera`` (4x4, camera axes x right, y down, z forward), perhaps also ``split`` ("train" or "test"),
 ``lens`` ("fisheye": dist is then OpenCV's fisheye k1 k2 k3 k4), ``mask`` (path of a PNG that is 0 at the pixels to
-ignore) and ``provenance`` (how the pose is known: ``source``, "given" or "placed", and the radii of its errors,
-``position_68_m``, ``position_95_m``, ``rotation_68_deg``, ``rotation_95_deg``); and beside them ``metric`` (false: the
-unit of length is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the Earth,
-`mapless.geodesy.Datum`: ``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with
+ignore), ``depth`` (see `depths`) and ``provenance`` (how the pose is known: ``source``, "given" or "placed", and the
+radii of its errors, ``position_68_m``, ``position_95_m``, ``rotation_68_deg``, ``rotation_95_deg``); and beside them
+``metric`` (false: the unit of length is arbitrary), ``source``, ``ground_truth``, ``datum`` (where the world is on the
+Earth, `mapless.geodesy.Datum`: ``latitude_deg``, ``longitude_deg``, ``height_m``, perhaps ``enu_from_world`` with
 ``x y z w``) and ``down_in_world``.
 """
 
@@ -25,6 +25,9 @@ from mapless.provenance import provenance_from_json
 from mapless_tools.dataset import Dataset, finite_numbers, image_file, named, printable, read_json, read_place
 
 from .collecting import Collector, ReadOptions
+from .depths import depth_of_frame
+
+_NOTHING: Mapping[Any, Any] = MappingProxyType({})
 
 
 def fits(path: Path) -> bool:
@@ -46,7 +49,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     for index, entry in enumerate(content["frames"]):
         image = entry.get("image", "?") if isinstance(entry, dict) else "?"
         with collector.attempt(f"{FOLDER_FILE}: frames[{index}] ({image})"):
-            add_frame(collector, entry, names)
+            add_frame(collector, entry, names, content)
     texts = {it: printable(str(content[it])) for it in ("source", "ground_truth") if isinstance(content.get(it), str)}
     dataset = collector.dataset(path.resolve().name, "cameras", metric=metric, **texts)
     datum, down_in_world = read_place(file, content)
@@ -82,8 +85,16 @@ def read_folder(path: Path) -> Dataset:
     return dataset
 
 
-def add_frame(collector: Collector, entry: Any, names: Mapping[Path, str] = MappingProxyType({})) -> None:
-    """Adds an entry of `frames`, named by its file, or as the file itself; ValueError names the wrong field."""
+def add_frame(
+    collector: Collector,
+    entry: Any,
+    names: Mapping[Path, str] = _NOTHING,
+    beside: Mapping[str, Any] = _NOTHING,
+) -> None:
+    """Adds an entry of `frames`, named by its file, or as the file itself; ValueError names the wrong field.
+
+    `beside` has what is said of the depths of all frames.
+    """
     if not isinstance(entry, dict):
         raise ValueError("must be an object")
     image = entry.get("image")
@@ -99,5 +110,6 @@ def add_frame(collector: Collector, entry: Any, names: Mapping[Path, str] = Mapp
     with named("provenance"):
         provenance = provenance_from_json(entry.get("provenance"))
     file = collector.image(image)
+    depth = depth_of_frame(collector.folder, entry, beside)
     name = names.get(file, file.stem)
-    collector.add(image, camera, pose, entry.get("split", ""), name, entry.get("mask"), provenance)
+    collector.add(image, camera, pose, entry.get("split", ""), name, entry.get("mask"), provenance, depth)

@@ -19,7 +19,7 @@ from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ANY_SIZE, image_size
 from mapless_tools.bags.options import BagOptions
-from mapless_tools.dataset import Dataset, Frame, Refusal, image_file, legal_id, named
+from mapless_tools.dataset import Dataset, DepthFile, Frame, Refusal, image_file, legal_id, named
 
 
 @dataclass(frozen=True)
@@ -122,6 +122,7 @@ class Collector:
         name: str = "",
         mask: str | None = None,
         provenance: Provenance = GIVEN_POSE,
+        depth: DepthFile | None = None,
     ) -> None:
         """Adds a frame; ValueError names what is wrong.
 
@@ -135,7 +136,7 @@ class Collector:
         # The folders belong to the id: sequences count their frames from 0, each of them.
         parts = PurePosixPath(name or file.relative_to(self.folder).with_suffix("")).parts
         identifier = legal_id("_".join(parts), self._ids)
-        frame = Frame(identifier, file, camera, world_from_camera, split, self._mask(mask), provenance)
+        frame = Frame(identifier, file, camera, world_from_camera, split, self._mask(mask), provenance, depth)
         self.frames.append(frame)
         self._ids.add(identifier)
         self._images.add(file)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from mapless import Scene
@@ -24,7 +24,7 @@ class PosedImage:
     """An image that is stored under `name` in the layout's folder of images, with its camera and pose.
 
     If it `has_mask`, that is stored in the folder `mapless.masks.FOLDER` under COLMAP's name. `provenance` says how the
-    pose is known; only `cameras.json` has it.
+    pose is known, and `depth` has the entries of its depth (see `depths`); only `cameras.json` has them.
     """
 
     name: str
@@ -32,6 +32,7 @@ class PosedImage:
     world_from_camera: RigidTransform
     has_mask: bool = False
     provenance: Provenance = GIVEN_POSE
+    depth: Mapping[str, Any] = field(default_factory=dict)
 
 
 Describe = Callable[..., dict[str, str]]
@@ -135,6 +136,7 @@ def _entry(image: PosedImage) -> dict[str, Any]:
         entry["mask"] = f"{MASKS}/{mask_name(image.name)}"
     if provenance := provenance_to_json(image.provenance):
         entry["provenance"] = provenance
+    entry |= image.depth
     model = DEFAULT_LENS_MODEL if lens is None else lens_model_of(lens)
     return entry if model == DEFAULT_LENS_MODEL else entry | {"lens": model}
 

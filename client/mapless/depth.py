@@ -1,0 +1,233 @@
+"""Depth images that were measured with photographs, and what is known of their sensors."""
+
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass, replace
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import wire
+from .geometry import Camera, RigidTransform
+from .v1 import geometry_pb2 as pb
+from .wire import FieldError, joined
+
+_SENSORS: wire.ProtoEnum = pb.DepthSensor
+
+MIN_UNIT_M, MAX_UNIT_M = 1e-6, 100.0
+"""Of the values of depth images."""
+MAX_APART_M, MAX_TURNED_DEG = 1.0, 45.0
+"""From a photograph's camera to its depth camera, and between their viewing directions."""
+
+
+class DepthSensor(str, Enum):
+    """Kinds of depth sensors, whose noise differs."""
+
+    UNKNOWN = "unknown"
+    TIME_OF_FLIGHT = "time_of_flight"
+    STRUCTURED_LIGHT = "structured_light"
+    STEREO = "stereo"
+    PHONE_LIDAR = "phone_lidar"
+    RENDERED = "rendered"
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """Errors of a depth sensor: a depth z has the standard deviation constant_m + linear z + quadratic_per_m z^2.
+
+    Attributes:
+        constant_m: standard deviation at any distance, metres.
+        linear: share of the depth that is added.
+        quadratic_per_m: share of the squared depth that is added, per metre.
+        common: standard deviation of the factor that all depths of an image share, as a share.
+
+    ValueError if a number is negative or not finite, or the standard deviation is 0.
+    """
+
+    constant_m: float = 0.0
+    linear: float = 0.0
+    quadratic_per_m: float = 0.0
+    common: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{name} must be finite and at least 0, is {value:g}")
+        if not self.constant_m + self.linear + self.quadratic_per_m > 0:
+            raise ValueError("constant_m, linear or quadratic_per_m must be above 0: no sensor is exact")
+
+    def sigma_m(self, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviation of depths, metres."""
+        return self.constant_m + self.linear * depth_m + self.quadratic_per_m * depth_m**2
+
+
+NOISE = {
+    DepthSensor.STRUCTURED_LIGHT: DepthNoise(0.0012, 0.0, 0.0019, 0.02),
+    DepthSensor.STEREO: DepthNoise(0.001, 0.0, 0.0025, 0.01),
+    DepthSensor.TIME_OF_FLIGHT: DepthNoise(0.008, 0.0, 0.0, 0.005),
+    DepthSensor.PHONE_LIDAR: DepthNoise(0.01, 0.005, 0.0, 0.025),
+    DepthSensor.RENDERED: DepthNoise(0.0, 0.001, 0.0, 0.001),
+    DepthSensor.UNKNOWN: DepthNoise(0.01, 0.01, 0.0, 0.05),
+}
+"""Noise by the kind of sensor; docs/guides/depth.md has the sources."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """A depth image as its sensor gave it.
+
+    A value is the distance along the viewing direction of the depth camera (z), not along the ray. No value is 0, in a
+    PNG also 65535, and as float32 also NaN or infinity.
+
+    Attributes:
+        data: the bytes of a PNG with one channel of 16 bits; or float32 values, little-endian, row by row.
+        unit_m: length of 1 in these values, metres: 0.001 for millimetres.
+        size: width and height of float32 values, pixels; None for a PNG.
+        sensor: the kind of sensor, which gives the noise.
+        camera: the depth camera, in pixels of the depth image; None: the photograph's own, scaled to its size.
+        camera_from_depth_camera: pose of the depth camera in the photograph's camera, metres; None: they are the same.
+        confidence: the bytes of a PNG with one channel of 8 bits, of the same size; empty for none.
+        min_confidence: depths with a smaller confidence are not used.
+        noise: the sensor's noise, in place of that of its kind.
+    """
+
+    data: bytes
+    unit_m: float
+    size: tuple[int, int] | None = None
+    sensor: DepthSensor = DepthSensor.UNKNOWN
+    camera: Camera | None = None
+    camera_from_depth_camera: RigidTransform | None = None
+    confidence: bytes = b""
+    min_confidence: int = 1
+    noise: DepthNoise | None = None
+
+    @staticmethod
+    def of_metres(depth_m: NDArray[np.float32], sensor: DepthSensor = DepthSensor.UNKNOWN) -> "DepthImage":
+        """The image of depths (H, W) in metres, of the photograph's own camera. ValueError for another shape."""
+        if depth_m.ndim != 2:
+            raise ValueError(f"depth_m must have rows and columns, has the shape {depth_m.shape}")
+        height, width = depth_m.shape
+        return DepthImage(np.ascontiguousarray(depth_m, "<f4").tobytes(), 1.0, (width, height), sensor)
+
+    @property
+    def known_noise(self) -> DepthNoise:
+        """Its noise: the given one, or that of its kind of sensor."""
+        return self.noise or NOISE[self.sensor]
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of its values and confidence, bytes."""
+        return len(self.data) + len(self.confidence)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of all that it consists of, hexadecimal; equal depths have equal ones."""
+        pose = self.camera_from_depth_camera
+        description = {
+            "unit_m": self.unit_m,
+            "size": self.size and list(self.size),
+            "sensor": self.sensor.value,
+            "camera": self.camera and str(self.camera),
+            "camera_from_depth_camera": pose and (pose.matrix().round(9) + 0.0).tolist(),
+            "min_confidence": self.min_confidence,
+            "noise": self.noise and asdict(self.noise),
+        }
+        digest = hashlib.sha256(json.dumps(description).encode())
+        for part in (self.data, self.confidence):
+            digest.update(len(part).to_bytes(8, "little") + part)
+        return digest.hexdigest()
+
+
+def depth_to_message(depth: DepthImage, field: str = "depth") -> pb.DepthImage:
+    """Message of a depth image; TypeError, naming the field, for another type."""
+    wire.require(depth, DepthImage, field, "one is made by DepthImage(data, unit_m)")
+    message = pb.DepthImage(confidence=depth.confidence)
+    wire.set_numbers(message, {"unit_m": depth.unit_m, "min_confidence": depth.min_confidence}, field)
+    if depth.sensor is not DepthSensor.UNKNOWN:
+        message.sensor = wire.enum_value(_SENSORS, depth.sensor)
+    if depth.size is None:
+        message.png = depth.data
+    else:
+        message.float32 = depth.data
+        message.width_px, message.height_px = depth.size
+    if depth.camera is not None:
+        message.intrinsics.CopyFrom(wire.camera_to_message(depth.camera, joined(field, "camera")))
+    if depth.camera_from_depth_camera is not None:
+        pose = wire.transform_to_message(depth.camera_from_depth_camera, joined(field, "camera_from_depth_camera"))
+        message.camera_from_depth_camera.CopyFrom(pose)
+    if depth.noise is not None:
+        message.noise.CopyFrom(pb.DepthNoise(**asdict(depth.noise)))
+    return message
+
+
+def depth_from_message(message: pb.DepthImage, field: str) -> DepthImage:
+    """Depth image of a message, whose bytes are not read.
+
+    FieldError if the values are missing, or a number is not finite or out of the range that geometry.proto states.
+    """
+    kind = message.WhichOneof("values")
+    if kind is None:
+        raise FieldError(joined(field, "png"), "is required, or float32")
+    if not MIN_UNIT_M <= message.unit_m <= MAX_UNIT_M:
+        text = f"must be {MIN_UNIT_M:g} to {MAX_UNIT_M:g}, is {message.unit_m:g}: 0.001 for millimetres"
+        raise FieldError(joined(field, "unit_m"), text)
+    if not 0 <= message.min_confidence <= 255:
+        raise FieldError(joined(field, "min_confidence"), f"must be 0 to 255, is {message.min_confidence}")
+    if message.sensor not in _SENSORS.values():
+        raise FieldError(joined(field, "sensor"), f"must be one of DepthSensor's values, is {message.sensor}")
+    name = _SENSORS.Name(message.sensor).removeprefix(wire.enum_prefix(_SENSORS))
+    depth = DepthImage(
+        getattr(message, kind),
+        message.unit_m,
+        _size_from_message(message, field) if kind == "float32" else None,
+        DepthSensor[name] if message.sensor else DepthSensor.UNKNOWN,
+        confidence=message.confidence,
+        min_confidence=message.min_confidence or 1,
+    )
+    if message.HasField("intrinsics"):
+        depth = replace(depth, camera=wire.camera_from_message(message.intrinsics, joined(field, "intrinsics")))
+    if message.HasField("camera_from_depth_camera"):
+        depth = replace(depth, camera_from_depth_camera=_extrinsics_from_message(message, field))
+    if message.HasField("noise"):
+        depth = replace(depth, noise=_noise_from_message(message.noise, joined(field, "noise")))
+    return depth
+
+
+def _size_from_message(message: pb.DepthImage, field: str) -> tuple[int, int]:
+    for side in ("width_px", "height_px"):
+        value = getattr(message, side)
+        if not wire.MIN_SIDE_PX <= value <= wire.MAX_SIDE_PX:
+            raise FieldError(joined(field, side), f"must be {wire.MIN_SIDE_PX} to {wire.MAX_SIDE_PX}, is {value}")
+    expected = 4 * message.width_px * message.height_px
+    if len(message.float32) != expected:
+        size = f"{message.width_px}x{message.height_px} values of 4 bytes are {expected}"
+        raise FieldError(joined(field, "float32"), f"has {len(message.float32)} bytes, {size}")
+    return message.width_px, message.height_px
+
+
+def _extrinsics_from_message(message: pb.DepthImage, field: str) -> RigidTransform:
+    path = joined(field, "camera_from_depth_camera")
+    pose = wire.transform_from_message(message.camera_from_depth_camera, path)
+    apart_m = float(np.linalg.norm(pose.translation))
+    if apart_m > MAX_APART_M:
+        text = f"must be at most {MAX_APART_M:g} m away, is {apart_m:g} m; are these millimetres?"
+        raise FieldError(joined(path, "translation_m"), text)
+    turned_deg = math.degrees(math.acos(min(1.0, max(-1.0, float(pose.rotation[2, 2])))))
+    if turned_deg > MAX_TURNED_DEG:
+        text = (
+            f"must turn the viewing direction by at most {MAX_TURNED_DEG:g} degrees, turns it by {turned_deg:.0f}: the "
+            "axes of both cameras are x right, y down, z forward"
+        )
+        raise FieldError(joined(path, "rotation"), text)
+    return pose
+
+
+def _noise_from_message(message: pb.DepthNoise, field: str) -> DepthNoise:
+    if not message.common <= 1:
+        raise FieldError(joined(field, "common"), f"must be 0 to 1, is {message.common:g}")
+    try:
+        return DepthNoise(message.constant_m, message.linear, message.quadratic_per_m, message.common)
+    except ValueError as error:
+        raise FieldError(field, str(error)) from None

@@ -1,0 +1,109 @@
+"""Decodes depth images: PNG files with one channel of 16 bits, or values of 32 bits.
+
+The header is checked when a request is read, the values when they are decoded.
+"""
+
+from dataclasses import replace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.depth import DepthImage
+from mapless_server.errors import InvalidArgument
+
+from .decode import ImageLimits, image_size
+from .png_chunks import essential_png, png_chunk_names
+
+T = TypeVar("T", np.uint8, np.uint16)
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_BITS, _COLOUR = 24, 25
+"""Positions of the bits of a channel, and of the colour type, in a PNG."""
+_GREY = 0
+_SATURATED = 65535
+
+
+def check_depth(depth: DepthImage, photo: tuple[int, int], limits: ImageLimits, field: str = "depth") -> None:
+    """Checks what a depth image says of itself, for a photograph of this size, (width, height) pixels.
+
+    InvalidArgument, naming the field, if the bytes are no PNG with one channel of 16 bits, too many, animated, or of
+    another size than the depth camera, or without one than the photograph's aspect; likewise its confidence, of 8 bits.
+    """
+    path, size = f"{field}.png", depth.size
+    if size is None:
+        size = _checked_png(depth.data, 16, limits, path)
+    elif len(depth.data) > limits.max_bytes or size[0] * size[1] > limits.max_pixels:
+        message = f"the depth has {len(depth.data)} bytes, at most {limits.max_bytes} are accepted"
+        raise InvalidArgument(message, reason="DEPTH_TOO_LARGE", field=f"{field}.float32")
+    camera = depth.camera
+    if camera is not None and (camera.width_px, camera.height_px) != size:
+        message = (
+            f"the depth is {size[0]}x{size[1]} pixels, its intrinsics are for {camera.width_px}x{camera.height_px}"
+        )
+        raise InvalidArgument(message, reason="DEPTH_SIZE", field=f"{field}.intrinsics")
+    if camera is None and abs(size[0] * photo[1] - size[1] * photo[0]) > max(*photo, *size):
+        message = (
+            f"the depth is {size[0]}x{size[1]} pixels, the photograph {photo[0]}x{photo[1]}, which is another aspect: "
+            "give the intrinsics of the depth camera"
+        )
+        raise InvalidArgument(message, reason="DEPTH_SIZE", field=f"{field}.intrinsics")
+    if depth.confidence:
+        path = f"{field}.confidence"
+        if (found := _checked_png(depth.confidence, 8, limits, path)) != size:
+            message = f"the confidence is {found[0]}x{found[1]} pixels, the depth {size[0]}x{size[1]}"
+            raise InvalidArgument(message, reason="DEPTH_SIZE", field=path)
+
+
+def decode_depth(
+    depth: DepthImage, photo: tuple[int, int], limits: ImageLimits, field: str = "depth"
+) -> NDArray[np.float32]:
+    """Depths (H, W) of a depth image, in the unit of poses; NaN where there is none.
+
+    InvalidArgument as of `check_depth`, or if the bytes are damaged, a value is below 0, or there is no value.
+    """
+    check_depth(depth, photo, limits, field)
+    if depth.size is None:
+        steps = _decoded(depth.data, np.uint16, f"{field}.png")
+        values = np.where((steps == 0) | (steps == _SATURATED), np.nan, steps).astype(np.float32)
+    else:
+        values = np.frombuffer(depth.data, "<f4").reshape(depth.size[::-1])
+        if (values < 0).any():
+            message = f"depths must not be below 0, the least is {np.nanmin(values):g}; is its camera's z backward?"
+            raise InvalidArgument(message, reason="DEPTH_NEGATIVE", field=f"{field}.float32")
+        values = np.where(np.isfinite(values) & (values > 0), values, np.float32(np.nan))
+    if depth.confidence:
+        confidence = _decoded(depth.confidence, np.uint8, f"{field}.confidence")
+        values[confidence < depth.min_confidence] = np.nan
+    if np.isnan(values).all():
+        message = "no pixel of the depth has a value that is used"
+        raise InvalidArgument(message, reason="DEPTH_EMPTY", field=field)
+    return np.asarray(values * np.float32(depth.unit_m), np.float32)
+
+
+def _checked_png(data: bytes, bits: int, limits: ImageLimits, field: str) -> tuple[int, int]:
+    """Width and height of a PNG with one channel of so many bits, by its header."""
+    if not data.startswith(_PNG):
+        raise InvalidArgument(f"must be a PNG with one channel of {bits} bits", reason="DEPTH_NOT_PNG", field=field)
+    size = image_size(data, replace(limits, min_side_px=1), field)
+    if data[_BITS] != bits or data[_COLOUR] != _GREY:
+        message = (
+            f"the PNG must have one channel of {bits} bits, has {data[_BITS]} bits and colour type {data[_COLOUR]}"
+        )
+        raise InvalidArgument(message, reason="DEPTH_UNSUPPORTED", field=field)
+    if b"acTL" in png_chunk_names(data):
+        raise InvalidArgument("the PNG is animated; it must have one picture", reason="DEPTH_UNSUPPORTED", field=field)
+    return size
+
+
+def _decoded(data: bytes, kind: type[T], field: str) -> NDArray[T]:
+    essential = essential_png(data, field, "depth")
+    try:
+        pixels = cv2.imdecode(np.frombuffer(essential, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None or pixels.ndim != 2 or pixels.dtype != kind:
+        message = "the PNG cannot be decoded: truncated or damaged"
+        raise InvalidArgument(message, reason="IMAGE_UNDECODABLE", field=field)
+    return np.asarray(pixels, kind)

@@ -1,0 +1,121 @@
+"""The depth of frames in `cameras.json`.
+
+A frame's ``depth`` is the path of a PNG of 16 bits, or of float32 values (``.f32``, little-endian, row by row). What is
+said of it, in the frame or for all frames beside ``frames``: ``depth_unit_m`` (0.001 for millimetres), ``depth_sensor``
+(of `DepthSensor`) or ``depth_noise`` (of `DepthNoise`), ``depth_K`` with ``depth_width``, ``depth_height``,
+``depth_dist`` and ``depth_lens`` if another camera than the photograph's saw it, ``camera_from_depth_camera`` (4x4)
+where that is elsewhere, and ``depth_confidence`` (path of a PNG of 8 bits) with ``depth_min_confidence``.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from mapless.cameras import camera_of_frame
+from mapless.depth import DepthImage, DepthNoise, DepthSensor
+from mapless.geometry import Camera, RigidTransform
+from mapless.lenses import DEFAULT_LENS_MODEL, lens_model_of
+from mapless_tools.dataset import DepthFile, finite_numbers, image_file, named
+
+FOLDER = "depth"
+"""Where exports put them."""
+FLOAT32 = ".f32"
+_OF_CAMERA = ("width", "height", "K", "dist", "lens")
+
+
+def depth_of_frame(folder: Path, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> DepthFile | None:
+    """The depth of an entry of `frames`, if it has one; `beside` is said of all. ValueError names a wrong field."""
+    if entry.get("depth") is None:
+        return None
+    said = {**beside, **entry}
+    with named("depth"):
+        path = _file(folder, entry["depth"])
+    with named("depth_unit_m"):
+        unit_m = float(finite_numbers(said.get("depth_unit_m"), "it", ()))
+    with named("depth_sensor"):
+        sensor = DepthSensor(said.get("depth_sensor", DepthSensor.UNKNOWN.value))
+    camera = _camera(said)
+    return DepthFile(
+        path,
+        unit_m,
+        sensor,
+        camera,
+        _read(
+            said, "camera_from_depth_camera", lambda it: RigidTransform.from_matrix(finite_numbers(it, "it", (4, 4)))
+        ),
+        _read(said, "depth_confidence", lambda it: _file(folder, it)),
+        int(said.get("depth_min_confidence", 1)),
+        _read(said, "depth_noise", lambda it: DepthNoise(**it)),
+        _size(said, entry) if path.suffix == FLOAT32 else None,
+    )
+
+
+def depth_entry(depth: DepthImage, name: str) -> dict[str, Any]:
+    """The entries of a frame for a depth that is stored under this name in `FOLDER`; see `depth_name`."""
+    entry: dict[str, Any] = {"depth": f"{FOLDER}/{name}", "depth_unit_m": depth.unit_m}
+    entry["depth_sensor"] = depth.sensor.value
+    if depth.size is not None:
+        entry["depth_width"], entry["depth_height"] = depth.size
+    if depth.camera is not None:
+        entry |= {f"depth_{field}": value for field, value in _camera_entry(depth.camera).items()}
+    if depth.camera_from_depth_camera is not None:
+        entry["camera_from_depth_camera"] = depth.camera_from_depth_camera.matrix().tolist()
+    if depth.confidence:
+        entry |= {"depth_confidence": f"{FOLDER}/{confidence_name(name)}", "depth_min_confidence": depth.min_confidence}
+    if depth.noise is not None:
+        entry["depth_noise"] = asdict(depth.noise)
+    return entry
+
+
+def depth_name(image: str, depth: DepthImage) -> str:
+    """File name of the depth of an image."""
+    return image + (".png" if depth.size is None else FLOAT32)
+
+
+def confidence_name(name: str) -> str:
+    """File name of the confidence of a depth, from the depth's."""
+    return f"{name}.confidence.png"
+
+
+def _file(folder: Path, path: object) -> Path:
+    if not isinstance(path, str) or not path:
+        raise ValueError(f"must be a path, is {path!r}")
+    return image_file(folder, path)
+
+
+def _read(said: Mapping[str, Any], field: str, read: Callable[[Any], Any]) -> Any:
+    if said.get(field) is None:
+        return None
+    with named(field):
+        try:
+            return read(said[field])
+        except TypeError as error:  # of numbers by other names
+            raise ValueError(str(error)) from error
+
+
+def _pose(matrix: object) -> RigidTransform:
+    return RigidTransform.from_matrix(finite_numbers(matrix, "it", (4, 4)))
+
+
+def _size(said: Mapping[str, Any], entry: Mapping[str, Any]) -> tuple[int, int]:
+    return int(said.get("depth_width", entry["width"])), int(said.get("depth_height", entry["height"]))
+
+
+def _camera(said: Mapping[str, Any]) -> Camera | None:
+    """The depth camera, None if it is the photograph's; its size is the photograph's unless it is given."""
+    if said.get("depth_K") is None:
+        return None
+    with named("depth_K"):
+        size = {side: said[side] for side in ("width", "height") if side in said}
+        named_so = {it: said[f"depth_{it}"] for it in _OF_CAMERA if said.get(f"depth_{it}") is not None}
+        return camera_of_frame(size | named_so)
+
+
+def _camera_entry(camera: Camera) -> dict[str, Any]:
+    entry: dict[str, Any] = {"width": camera.width_px, "height": camera.height_px, "K": camera.matrix().tolist()}
+    if (lens := camera.distortion) is not None:
+        entry["dist"] = list(vars(lens).values())
+        if (model := lens_model_of(lens)) != DEFAULT_LENS_MODEL:
+            entry["lens"] = model
+    return entry

@@ -1,0 +1,91 @@
+"""Depth images as messages: nothing is lost, and numbers out of range are named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mapless import Camera, DepthImage, DepthNoise, DepthSensor, Fisheye, RigidTransform
+from mapless.depth import depth_from_message, depth_to_message
+from mapless.geometry import rotation_from_vector
+from mapless.v1 import geometry_pb2 as pb
+from mapless.wire import FieldError
+
+FULL = DepthImage(
+    b"values",
+    0.0002,
+    None,
+    DepthSensor.STRUCTURED_LIGHT,
+    Camera(320, 240, 285.0, 286.0, 160.0, 120.0, Fisheye(0.1, 0.0, 0.0, 0.0)),
+    RigidTransform(rotation_from_vector([0.1, -0.2, 1.5]), np.array([-0.0225, -0.005, 0.001])),
+    b"confidence",
+    2,
+    DepthNoise(0.001, 0.002, 0.003, 0.004),
+)
+
+
+def test_a_depth_comes_back_from_its_message() -> None:
+    found = depth_from_message(depth_to_message(FULL), "depth")
+    assert found.sha256 == FULL.sha256
+    assert (found.camera, found.noise, found.sensor) == (FULL.camera, FULL.noise, FULL.sensor)
+    metres = DepthImage.of_metres(np.full((48, 64), 2, np.float32), DepthSensor.RENDERED)
+    assert depth_from_message(depth_to_message(metres), "depth").sha256 == metres.sha256
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"data": b"other"},
+        {"unit_m": 0.001},
+        {"sensor": DepthSensor.STEREO},
+        {"camera": None},
+        {"camera_from_depth_camera": None},
+        {"confidence": b""},
+        {"min_confidence": 1},
+        {"noise": None},
+    ],
+    ids=lambda it: next(iter(it)),
+)
+def test_depths_that_differ_in_anything_have_other_hashes(change: dict[str, object]) -> None:
+    assert replace(FULL, **change).sha256 != FULL.sha256  # type: ignore[arg-type]
+
+
+def extrinsics(x_m: float = 0.0, turn_rad: float = 0.0) -> pb.RigidTransform:
+    pose = RigidTransform(rotation_from_vector([0, turn_rad, 0]), np.array([x_m, 0, 0]))
+    return depth_to_message(replace(FULL, camera_from_depth_camera=pose)).camera_from_depth_camera
+
+
+BAD = {
+    "no values": (pb.DepthImage(unit_m=1), "png"),
+    "no unit": (pb.DepthImage(png=b"x"), "unit_m"),
+    "a unit of NaN": (pb.DepthImage(png=b"x", unit_m=float("nan")), "unit_m"),
+    "confidence beyond 8 bits": (pb.DepthImage(png=b"x", unit_m=1, min_confidence=256), "min_confidence"),
+    "an unknown sensor": (pb.DepthImage(png=b"x", unit_m=1, sensor=99), "sensor"),  # type: ignore[arg-type]
+    "values without size": (pb.DepthImage(float32=b"1234", unit_m=1), "width_px"),
+    "values of another size": (pb.DepthImage(float32=b"1234", unit_m=1, width_px=32, height_px=32), "float32"),
+    "a camera without focal length": (
+        pb.DepthImage(png=b"x", unit_m=1, intrinsics=pb.CameraIntrinsics(width_px=64, height_px=48)),
+        "intrinsics.focal_x_px",
+    ),
+    "millimetres of extrinsics": (
+        pb.DepthImage(png=b"x", unit_m=1, camera_from_depth_camera=extrinsics(x_m=-22.5)),
+        "camera_from_depth_camera.translation_m",
+    ),
+    "turned by 90 degrees": (
+        pb.DepthImage(png=b"x", unit_m=1, camera_from_depth_camera=extrinsics(turn_rad=np.pi / 2)),
+        "camera_from_depth_camera.rotation",
+    ),
+    "no noise": (pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise()), "noise"),
+    "negative noise": (pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise(linear=-1)), "noise"),
+    "a scale beyond 100 %": (
+        pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise(linear=1, common=2)),
+        "noise.common",
+    ),
+}
+
+
+@pytest.mark.parametrize(("message", "field"), BAD.values(), ids=BAD)
+def test_numbers_out_of_range_are_named(message: pb.DepthImage, field: str) -> None:
+    with pytest.raises(FieldError) as raised:
+        depth_from_message(message, "depth")
+    assert raised.value.field == f"depth.{field}"

@@ -1,0 +1,105 @@
+"""Measured depth at keypoints: planted planes and steps, seen by the same camera, a smaller one and another one."""
+
+import numpy as np
+import pytest
+
+from mapless import DepthNoise, Fisheye
+from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, View
+from mapless_server.method.structure.measured_depth import MeasuredDepth
+
+CAMERA = Camera(640, 480, 520.0, 520.0, 322.0, 238.0)
+NOISE = DepthNoise(0.001, 0.0, 0.002, 0.01)
+NORMAL, DISTANCE_M = np.array([0.35, -0.2, 1.0]), 2.0
+"""A slanted plane, normal . x = distance."""
+
+
+def view_of(camera: Camera = CAMERA, count: int = 500) -> View:
+    random = np.random.default_rng(0)
+    pixels = random.uniform([20, 20], [camera.width_px - 21, camera.height_px - 21], (count, 2)).astype(np.float32)
+    features = Features(pixels, np.zeros((count, 128), np.uint8), np.ones(count, np.float32))
+    return View(camera.pinhole(), features)
+
+
+def plane_depth(rays: np.ndarray) -> np.ndarray:
+    return np.asarray(DISTANCE_M / (rays @ NORMAL))
+
+
+def plane_map(camera: Camera, camera_from_depth: RigidTransform | None = None) -> np.ndarray:
+    """The plane, fixed in the photograph's camera, as a depth camera sees it."""
+    rows, columns = np.mgrid[: camera.height_px, : camera.width_px]
+    rays = camera.rays(np.stack([columns, rows], axis=-1))
+    pose = camera_from_depth or RigidTransform.identity()
+    depth = (DISTANCE_M - pose.translation @ NORMAL) / (rays @ (pose.rotation.T @ NORMAL))
+    return np.asarray(depth, np.float32)
+
+
+def error_of(found: KeypointDepths, view: View) -> np.ndarray:
+    return np.asarray(found.depth / plane_depth(view.camera.rays(view.features.pixels())) - 1)
+
+
+@pytest.mark.parametrize("size", [(640, 480), (192, 144), (1280, 960)])
+def test_a_plane_has_its_depth_whatever_the_size_of_the_map(size: tuple[int, int]) -> None:
+    depth_camera, view = CAMERA.resized(*size), view_of()
+    found = MeasuredDepth(depth_camera, plane_map(depth_camera), NOISE).at_keypoints(view)
+    assert np.isfinite(found.depth).all()
+    np.testing.assert_allclose(error_of(found, view), 0, atol=1e-5)
+    np.testing.assert_allclose(found.relative_sigma, (0.001 + 0.002 * found.depth**2) / found.depth, rtol=1e-5)
+    assert (found.common_sigma, found.source) == (0.01, DepthSource.MEASURED)
+
+
+def test_another_camera_beside_sees_the_plane_too() -> None:
+    pose = RigidTransform(rotation_from_vector([0.01, -0.02, 0.015]), np.array([-0.0225, -0.005, 0.01]))
+    depth_camera = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
+    view = view_of()
+    found = MeasuredDepth(depth_camera, plane_map(depth_camera, pose), NOISE, pose).at_keypoints(view)
+    error = error_of(found, view)
+    assert np.isfinite(error).mean() > 0.75, "the narrower camera sees 80 % of the photograph"
+    assert np.nanquantile(np.abs(error), 0.95) < 0.002
+    mistaken = MeasuredDepth(depth_camera, plane_map(depth_camera, pose), NOISE).at_keypoints(view)
+    assert np.nanmedian(np.abs(error_of(mistaken, view))) > 0.003, "taken for the photograph's own camera it is off"
+
+
+def test_the_nearer_of_two_surfaces_hides_the_other() -> None:
+    pose = RigidTransform(np.eye(3), np.array([0.2, 0.0, 0.0]))
+    depth = np.full((480, 640), 4.0, np.float32)
+    depth[:, 200:400] = 1.0
+    found = MeasuredDepth(CAMERA, depth, NOISE, pose).seen_by(CAMERA).depth
+    columns = np.flatnonzero(np.abs(found[240] - 1.0) < 0.01)
+    assert columns.min() == pytest.approx(200 + 104, abs=1)
+    assert columns.max() == pytest.approx(399 + 104, abs=1)
+
+
+def test_there_is_no_depth_at_an_edge() -> None:
+    depth = np.full((480, 640), 2.0, np.float32)
+    depth[:, 320:] = 3.0
+    view = view_of()
+    found = MeasuredDepth(CAMERA, depth, NOISE).at_keypoints(view)
+    beside = np.abs(view.features.keypoints[:, 0] - 319.5)
+    assert np.isnan(found.depth[beside < 1]).all()
+    assert np.isfinite(found.depth[beside > 4]).all()
+    assert set(np.round(found.depth[np.isfinite(found.depth)], 4)) == {2.0, 3.0}
+
+
+def test_holes_of_the_sensor_have_no_depth() -> None:
+    depth = plane_map(CAMERA)
+    depth[100:200, 100:200] = np.nan
+    view = view_of()
+    found, pixels = MeasuredDepth(CAMERA, depth, NOISE).at_keypoints(view), view.features.keypoints
+    inside = ((pixels > 100) & (pixels < 199)).all(axis=1)
+    assert np.isnan(found.depth[inside]).all()
+    outside = ((pixels < 98) | (pixels > 201)).any(axis=1)
+    np.testing.assert_allclose(error_of(found, view)[outside], 0, atol=1e-5)
+
+
+def test_a_lens_bends_the_map_as_the_photograph() -> None:
+    lens = Camera(640, 480, 400.0, 400.0, 322.0, 238.0, Fisheye(0.05, -0.01, 0.0, 0.0))
+    view = view_of(lens, 300)
+    rows, columns = np.mgrid[:480, :640]
+    from mapless_server.method.features.views import undistort_pixels
+
+    ideal = undistort_pixels(np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(float), lens)
+    depth = plane_depth(lens.pinhole().rays(ideal)).reshape(480, 640).astype(np.float32)
+    error = error_of(MeasuredDepth(lens, depth, NOISE).at_keypoints(view), view)
+    assert np.isfinite(error).mean() > 0.9
+    assert np.nanmax(np.abs(error)) < 1e-3

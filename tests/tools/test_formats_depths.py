@@ -1,0 +1,72 @@
+"""Depth in `cameras.json`: what is said of one frame or of all, and wrong fields by their names."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.images import encode, textured
+from support.scenes import CAMERA
+
+from mapless import DepthNoise, DepthSensor
+from mapless.geometry import RigidTransform
+from mapless_tools.dataset import Dataset, DepthFile
+from mapless_tools.ingest.formats import read_dataset
+from mapless_tools.ingest.formats.writing import PosedImage, cameras_files
+
+ALL = {"depth_unit_m": 0.001, "depth_sensor": "stereo"}
+
+
+def read(path: Path, entry: dict[str, Any], beside: dict[str, Any]) -> Dataset:
+    """A folder of one photograph, with these entries of its frame and beside the frames."""
+    (text,) = cameras_files([PosedImage("1.png", CAMERA, RigidTransform.identity())], "test").values()
+    content = json.loads(text) | beside
+    content["frames"][0] |= entry
+    for folder in ("images", "depth"):
+        (path / folder).mkdir(exist_ok=True)
+    (path / "images" / "1.png").write_bytes(encode(".png", textured(CAMERA.width_px, CAMERA.height_px)))
+    (path / "depth" / "1.png").write_bytes(encode(".png", np.ones((60, 80), np.uint16)))
+    (path / "cameras.json").write_text(json.dumps(content))
+    return read_dataset(path)
+
+
+def depth_of(path: Path, entry: dict[str, Any], beside: dict[str, Any]) -> DepthFile:
+    (frame,) = read(path, entry, beside).frames
+    assert frame.depth is not None
+    return frame.depth
+
+
+def test_a_frame_says_more_than_what_is_beside_the_frames(tmp_path: Path) -> None:
+    found = depth_of(tmp_path, {"depth": "depth/1.png", "depth_unit_m": 0.0002}, ALL)
+    assert (found.unit_m, found.sensor, found.camera) == (0.0002, DepthSensor.STEREO, None)
+
+
+def test_another_camera_has_its_own_size_and_pose(tmp_path: Path) -> None:
+    k = [[80.0, 0, 40.0], [0, 81.0, 30.0], [0, 0, 1]]
+    pose = [[1, 0, 0, -0.02], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    entry = {"depth": "depth/1.png", "depth_K": k, "depth_width": 80, "depth_height": 60}
+    found = depth_of(tmp_path, entry | {"camera_from_depth_camera": pose, "depth_noise": {"linear": 0.02}}, ALL)
+    assert found.camera is not None
+    assert (found.camera.width_px, found.camera.focal_y_px) == (80, 81.0)
+    assert found.camera_from_depth_camera is not None
+    assert found.camera_from_depth_camera.translation[0] == -0.02
+    assert found.noise == DepthNoise(linear=0.02)
+
+
+@pytest.mark.parametrize(
+    ("entry", "field"),
+    [
+        ({"depth": "depth/2.png"}, "depth:"),
+        ({"depth": 1}, "depth:"),
+        ({"depth": "depth/1.png", "depth_unit_m": None}, "depth_unit_m:"),
+        ({"depth": "depth/1.png", "depth_sensor": "sonar"}, "depth_sensor:"),
+        ({"depth": "depth/1.png", "depth_K": 5}, "depth_K:"),
+        ({"depth": "depth/1.png", "camera_from_depth_camera": [1, 2]}, "camera_from_depth_camera:"),
+        ({"depth": "depth/1.png", "depth_noise": {"bias": 1}}, "depth_noise:"),
+    ],
+    ids=lambda it: it if isinstance(it, str) else "",
+)
+def test_a_wrong_field_is_named(tmp_path: Path, entry: dict[str, Any], field: str) -> None:
+    with pytest.raises(ValueError, match=field):
+        read(tmp_path, entry, ALL)
