@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,16 +39,8 @@ def map_photographs(
     """Writes pycolmap's models of a database into a folder: 0, 1, ...; none if no photographs fit together.
 
     The incremental mapper measures best; where it finds no beginning, the global one, which needs none, is tried.
-    Cameras with the `known` ids stay as they are.
+    Neither shows whether the camera moved, which `read_parts` judges. Cameras with the `known` ids stay as they are.
     """
-    options = pycolmap.IncrementalPipelineOptions(
-        min_model_size=FEWEST,
-        extract_colors=False,
-        num_threads=threads,
-        random_seed=SEED,
-        constant_cameras=set(known),
-    )
-    token = pycolmap.CancellationToken()
     registered = 0
 
     def add() -> None:
@@ -58,21 +50,45 @@ def map_photographs(
 
     progress("poses", 0, count)
     folder.mkdir()
+    map_incrementally(database, folder, known, threads, add)
+    if not any(folder.iterdir()):
+        map_globally(database, folder, threads)
+    progress("poses", count, count)
+    with pycolmap.Database.open(database) as content:
+        given = {it.camera_id: it for it in content.read_all_cameras()}
+    found = sorted(folder.iterdir())
+    for place in tracked("refinement", found, len(found), progress):
+        model = pycolmap.Reconstruction(str(place))
+        for number in set(known) & set(model.cameras):
+            model.cameras[number].params = given[number].params.tolist()  # the global mapper refines all
+        if model.num_reg_images() >= FEWEST and refine(model, known, threads):
+            model.write(str(place))
+
+
+def map_incrementally(
+    database: Path, folder: Path, known: Collection[int], threads: int, add: Callable[[], None] = lambda: None
+) -> None:
+    """Runs pycolmap's incremental mapper; `add` is called with each photograph that it adds."""
+    options = pycolmap.IncrementalPipelineOptions(
+        min_model_size=FEWEST,
+        extract_colors=False,
+        num_threads=threads,
+        random_seed=SEED,
+        constant_cameras=set(known),
+    )
+    token = pycolmap.CancellationToken()
     interruptible(
         lambda: pycolmap.incremental_mapping(
             database, database.parent, folder, options, next_image_callback=add, cancellation_token=token
         ),
         token.cancel,
     )
-    if not any(folder.iterdir()) and not _without_parallax(_verified(database)):
-        all_at_once = pycolmap.GlobalPipelineOptions(min_model_size=FEWEST, num_threads=threads, random_seed=SEED)
-        interruptible(lambda: pycolmap.global_mapping(database, database.parent, folder, all_at_once))
-    progress("poses", count, count)
-    found = sorted(folder.iterdir())
-    for place in tracked("refinement", found, len(found), progress):
-        model = pycolmap.Reconstruction(str(place))
-        if model.num_reg_images() >= FEWEST and refine(model, known, threads):
-            model.write(str(place))
+
+
+def map_globally(database: Path, folder: Path, threads: int) -> None:
+    """Runs pycolmap's global mapper."""
+    options = pycolmap.GlobalPipelineOptions(min_model_size=FEWEST, num_threads=threads, random_seed=SEED)
+    interruptible(lambda: pycolmap.global_mapping(database, database.parent, folder, options))
 
 
 def read_parts(

@@ -24,6 +24,7 @@ from mapless_tools.demo.photographs import Photograph, room
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.metres import umeyama
 from mapless_tools.progress import Progress
+from mapless_tools.reconstruct import mapping
 from mapless_tools.reconstruct.cameras import LensOptions, starting_cameras
 from mapless_tools.reconstruct.features import FeatureFolder
 from mapless_tools.reconstruct.folder import locked
@@ -328,3 +329,12 @@ def test_import_of_a_video_of_two_frames_says_what_is_needed(tmp_path: Path, mon
     assert "too few" in plain(result.output)
     result = CliRunner().invoke(app, ["import", str(tmp_path), "hall", "--tag", "36h11:0=0.1"])
     assert "the unit of a video" in plain(result.output)
+
+
+def test_global_mapper_finds_poses_where_the_other_does_not_begin(
+    source: Path, tmp_path: Path, chosen: Sequence[Photograph], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mapping, "map_incrementally", lambda *_: None)
+    result = reconstructed(source, tmp_path / "out")
+    assert len(result.part.posed) == len(chosen)
+    assert np.median(errors(result, chosen)) < 0.02
