@@ -145,7 +145,7 @@ def test_a_sequence_has_one_unknown_camera(client: Client) -> None:
     images = [photograph(it, SQUARE) for it in WALK]
     images[1] = encode(".png", textured(420, 420, seed=5))
     frames = groups_of([None] * 4, images)[1]
-    answer = client.localize_sequence(frames, "corner")
+    answer = client.localize_sequence(frames, "corner", timeout_s=120)
     assert isinstance(answer, SequenceLocalization), answer
     used = {(it.source, it.camera, it.focal_sigma_px) for it in (r.used_intrinsics for r in answer.images) if it}
     ((source, camera, sigma_px),) = used
@@ -160,12 +160,15 @@ def test_joint_radii_contain_what_the_camera_may_be_off(client: Client) -> None:
     radii_m = list[float]()
     for camera in (SQUARE, None):
         rig, frames = groups_of([camera] * 4, images)
-        answers = client.localize_rig(rig, "corner"), client.localize_sequence(frames, "corner")
+        answers = (
+            client.localize_rig(rig, "corner", timeout_s=120),
+            client.localize_sequence(frames, "corner", timeout_s=120),
+        )
         for answer in answers:
             assert isinstance(answer, RigLocalization | SequenceLocalization), answer
             radii_m.append(answer.accuracy.position_68_m)
-    assert radii_m[2] > radii_m[0]
-    assert radii_m[3] > radii_m[1]
+    for known_m, found_m in zip(radii_m[:2], radii_m[2:], strict=True):
+        assert known_m < found_m < 20 * known_m
 
 
 def test_images_of_a_rig_share_the_camera_of_equal_exif(client: Client) -> None:
@@ -173,7 +176,7 @@ def test_images_of_a_rig_share_the_camera_of_equal_exif(client: Client) -> None:
     wide = replace(CAMERA, focal_x_px=350.0, focal_y_px=350.0)
     images = [photograph(at, it) for at, it in zip(WALK, (wide, wide, OTHER, OTHER), strict=True)]
     images[:2] = [with_exif(it, film_mm(wide), "A") for it in images[:2]]
-    answer = client.localize_rig(groups_of([None, None, None, OTHER], images)[0], "corner")
+    answer = client.localize_rig(groups_of([None, None, None, OTHER], images)[0], "corner", timeout_s=120)
     assert isinstance(answer, RigLocalization), answer
     used = [it.used_intrinsics for it in answer.images]
     assert [it and it.source for it in used] == ["EXIF", "EXIF", "ESTIMATED", "GIVEN"]
@@ -186,11 +189,11 @@ def test_images_of_a_rig_share_the_camera_of_equal_exif(client: Client) -> None:
 def test_photographs_of_a_camera_that_none_determines_are_left_out(client: Client) -> None:
     images = [photograph(WALK[0], SQUARE), *[encode(".png", textured(420, 420, seed=i)) for i in range(3)]]
     rig, frames = groups_of([SQUARE, None, None, None], images)
-    answer = client.localize_rig(rig, "corner")
+    answer = client.localize_rig(rig, "corner", timeout_s=120)
     assert isinstance(answer, RigLocalization), answer
     assert [it.used_intrinsics is not None for it in answer.images] == [True, False, False, False]
     assert [it.match_count for it in answer.images[1:]] == [0, 0, 0]
-    unknown = client.localize_sequence([replace(it, camera=None) for it in frames[1:]], "corner")
+    unknown = client.localize_sequence([replace(it, camera=None) for it in frames[1:]], "corner", timeout_s=120)
     assert isinstance(unknown, GroupRejected)
     assert "focal length" in unknown.message
     assert unknown.hint is not None
@@ -200,5 +203,5 @@ def test_photographs_of_a_camera_that_none_determines_are_left_out(client: Clien
 def test_frames_of_one_camera_have_one_size(client: Client) -> None:
     frames = groups_of([None] * 4, [photograph(WALK[0]), *[photograph(it, SQUARE) for it in WALK[1:]]])[1]
     with pytest.raises(InvalidArgument) as raised:
-        client.localize_sequence(frames, "corner")
+        client.localize_sequence(frames, "corner", timeout_s=120)
     assert raised.value.field == "frames[1].intrinsics"

@@ -289,13 +289,14 @@ class GroupProblem(Generic[S]):
         hessian = matrix[references:, references:]
         if references:
             hessian = hessian - coupling.T @ np.linalg.solve(matrix[:references, :references], coupling)
-        covariance = _inverse(hessian)
+        inverse = _inverse(hessian)
+        covariance = inverse
         for by_errors, variances in self._by_intrinsics(point):
             gradient = by_errors[references:] / inflation**2
             if references:
                 known = np.linalg.solve(matrix[:references, :references], by_errors[:references] / inflation**2)
                 gradient = gradient - coupling.T @ known
-            motion = covariance @ gradient
+            motion = inverse @ gradient
             covariance = covariance + (motion * variances) @ motion.T
         return covariance
 
