@@ -9,7 +9,8 @@ whose error moves its projection along the epipolar line, so the covariance of a
 where sigma and s_d, the errors of keypoints and of single depths, are estimated from the residuals. Where these do not
 show the errors of depths, because the step is small, they are as stated. An error that all depths share, of the
 sensor's or the network's metre, changes no residual: it moves the camera along the step, and the covariance of the pose
-contains it as s^2 d d^T, with d the step and s its relative standard deviation.
+contains it as s^2 d d^T, with d the step and s its relative standard deviation. Neither do errors of the reference's
+pose, whose usual size the covariance contains.
 """
 
 from dataclasses import dataclass, replace
@@ -17,10 +18,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform, normalize_jacobian
+from mapless.geometry import Array, RigidTransform, cross_matrix, normalize_jacobian
 
 from ..bundle.dispersion import scale_covariance
 from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage
+from ..bundle.pose_problem import DRIFT_INFLATION, OWN_INFLATION, USUAL_DRIFT, USUAL_OWN
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import cauchy_weight, motion_jacobian, perturbed, solve_step, world_covariance
@@ -115,6 +117,7 @@ def solve_one_reference(
         return Rejection(RejectionReason.PNP_FAILED, message)
     pose = solved.world_from_camera
     covariance = _covariance(problem, solved)
+    covariance += _reference_covariance(problem, solved)
     covariance += scale_covariance(pose, reference.world_from_camera.translation, depths.common_sigma)
     estimate = PoseEstimate(pose, PoseStage.REFINED, solved.inliers, solved.errors_px, covariance)
     rows = np.arange(len(points))
@@ -256,6 +259,19 @@ def _covariance(problem: _Problem, solved: _Solved) -> Array:
     covariance *= 1 + solved.inliers.sum() / SHARED_MATCHES
     factor = np.repeat([1.0, ROTATION_FACTOR], 3)
     return np.asarray(factor[:, None] * covariance * factor)
+
+
+def _reference_covariance(problem: _Problem, solved: _Solved) -> Array:
+    """Covariance (6, 6) in the world by the errors of the reference's pose, with the sizes that are usual.
+
+    Its own, and what its poses drift over the step (see `bundle.pose_problem`); the query's pose moves with it.
+    """
+    camera, pose = problem.seen.camera, solved.world_from_camera
+    depth_m = float(np.median(pose.inverse().apply(problem.seen.x_in_world[solved.inliers])[:, 2]))
+    angle = solved.sigma_px / camera.focal_x_px * np.hypot(OWN_INFLATION * USUAL_OWN, DRIFT_INFLATION * USUAL_DRIFT)
+    moved = np.eye(6)
+    moved[:3, 3:] = cross_matrix(problem.reference_centre - pose.translation)
+    return np.asarray(moved * np.repeat([angle * depth_m, angle], 3) ** 2 @ moved.T)
 
 
 def score_of(problem: _Problem, solved: _Solved) -> float:
