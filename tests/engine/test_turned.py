@@ -307,3 +307,12 @@ def test_a_gravity_prior_turns_a_photograph_as_the_references_are_held(tmp_path:
             assert [it.rung for it in result.attempts] == [AS_IT_IS]
             assert isinstance(result.answer.support, PosedSupport)
             assert result.answer.support.query.upright_deg == turn_deg
+
+
+def test_a_false_gravity_prior_costs_a_rung_and_no_answer(localize: Localize) -> None:
+    prior = GravityPrior(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 2.0)
+    result = localize(photograph(TRUE), CAMERA, priors=Priors(gravity=prior))
+    assert isinstance(result.answer.outcome, Localization)
+    assert pose_error(result.answer.outcome.world_from_camera, TRUE)[0] < 0.01
+    assert len(result.attempts) == 2
+    assert [it.conflict for it in result.answer.outcome.prior_checks] == [True]
