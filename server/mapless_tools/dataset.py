@@ -1,11 +1,13 @@
 """Photographs of one place with known poses, whatever the layout on the disk; `ingest.formats` reads them."""
 
+from __future__ import annotations
+
 import json
 import os
 import re
 from collections.abc import Callable, Container, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -45,6 +47,15 @@ class DepthFile:
     min_confidence: int = 1
     noise: DepthNoise | None = None
     size: tuple[int, int] | None = None
+
+    def scaled(self, scale: float) -> DepthFile:
+        """The same depth in a unit of length of which there are `scale` in the present one."""
+        pose, noise = self.camera_from_depth_camera, self.noise
+        if pose is not None:
+            pose = RigidTransform(pose.rotation, scale * pose.translation)
+        if noise is not None:
+            noise = replace(noise, constant_m=scale * noise.constant_m, quadratic_per_m=noise.quadratic_per_m / scale)
+        return replace(self, unit_m=scale * self.unit_m, camera_from_depth_camera=pose, noise=noise)
 
     def read(self) -> DepthImage:
         """Reads the files; OSError."""
@@ -198,6 +209,13 @@ def image_file(folder: Path, image: str) -> Path:
         if os.path.isfile(folder / other):
             return folder / other
     raise ValueError(f"image: there is no file {file}")
+
+
+def path_in(folder: Path, path: object) -> Path:
+    """The file that a layout names beside an image, such as its depth; ValueError as `image_file`, or for no text."""
+    if not isinstance(path, str) or not path:
+        raise ValueError(f"must be a path, is {path!r}")
+    return image_file(folder, path)
 
 
 def _within(folder: Path, image: str) -> str:

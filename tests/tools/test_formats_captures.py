@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.images import encode
 from support.layouts import (
     CAMERA,
     Truth,
@@ -21,9 +22,11 @@ from support.layouts import (
     write_image,
 )
 
+from mapless.depth import DepthSensor
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.lenses import Fisheye, RadialTangential
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions, read_dataset
+from mapless_tools.ingest.metres import MetreOptions, in_metres
 
 TRUTH = truth()
 SHARED = {"fl_x": 80.0, "fl_y": 81.0, "cx": 47.75, "cy": 31.25, "w": 96, "h": 64}
@@ -51,6 +54,22 @@ def test_transforms_come_back_with_our_axes_and_pixels(tmp_path: Path) -> None:
     lens = RadialTangential(0.1, -0.2, 0.01, 0.02)
     assert_reads(dataset, replace(TRUTH, camera=replace(CAMERA, distortion=lens)))
     assert (dataset.format, dataset.metric) == ("nerf", False)
+
+
+def test_depths_of_transforms_are_scaled_with_the_poses(tmp_path: Path) -> None:
+    folder = write_transforms(tmp_path)
+    (folder / "depth.png").write_bytes(encode(".png", np.ones((64, 96), np.uint16)))
+    edit(folder / "transforms.json", lambda it: it["frames"][0].update(depth_file_path="depth.png"))
+    dataset = read_dataset(folder)
+    depth = dataset.frames[0].depth
+    assert depth is not None
+    assert (depth.path.name, depth.unit_m, dataset.frames[1].depth) == ("depth.png", 0.001, None)
+    scaled = in_metres(dataset, MetreOptions(scale=0.5)).frames[0].depth
+    assert scaled is not None
+    assert scaled.unit_m == 0.0005
+    edit(folder / "transforms.json", lambda it: it["frames"][0].update(depth_file_path="none.png"))
+    (reason,) = reasons(read_dataset(folder)).values()
+    assert reason.startswith("depth_file_path:")
 
 
 def test_an_applied_transform_and_scale_are_undone(tmp_path: Path) -> None:
@@ -226,6 +245,21 @@ def test_tum_interpolates_between_the_motion_captures_samples(tmp_path: Path) ->
         assert_same_pose(frame.world_from_camera, tum_pose(time_s), 1e-4)
         assert_same_camera(frame.camera, TUM_CAMERA)
     assert dataset.frames[1].name == "100.033000"
+
+
+def test_tum_photographs_have_the_depth_nearest_in_time(tmp_path: Path) -> None:
+    folder, times = write_tum(tmp_path / "rgbd_dataset_freiburg3_office")
+    (folder / "depth").mkdir()
+    lines = ["# depth maps"]
+    for time_s in (times[0] + 0.004, times[1] - 0.015, times[1] + 0.01):
+        (folder / "depth" / f"{time_s:.6f}.png").write_bytes(encode(".png", np.ones((480, 640), np.uint16)))
+        lines.append(f"{time_s:.6f} depth/{time_s:.6f}.png")
+    (folder / "depth.txt").write_text("\n".join(lines) + "\n")
+    depths = [frame.depth for frame in read_dataset(folder).frames]
+    names = [None if it is None else it.path.name for it in depths]
+    assert names == [f"{times[0] + 0.004:.6f}.png", f"{times[1] + 0.01:.6f}.png", None]
+    assert depths[0] is not None
+    assert (depths[0].unit_m, depths[0].sensor) == (0.0002, DepthSensor.STRUCTURED_LIGHT)
 
 
 def test_tum_frames_without_ground_truth_nearby_are_refused(tmp_path: Path) -> None:

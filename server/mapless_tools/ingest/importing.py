@@ -253,7 +253,11 @@ def _fits_scene(
         return False
     _print(f"aligned to the scene ({found.median_px:.2f} px over {found.pair_count} pairs): {found.text}")
     report.chosen = [
-        replace(frame, world_from_camera=found.world_from_other.transform_pose(frame.world_from_camera))
+        replace(
+            frame,
+            world_from_camera=found.world_from_other.transform_pose(frame.world_from_camera),
+            depth=frame.depth and frame.depth.scaled(found.world_from_other.scale),
+        )
         for frame in report.chosen
     ]
     return True

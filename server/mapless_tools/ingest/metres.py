@@ -322,7 +322,8 @@ def _transformed(frame: Frame, metres_from_units: Similarity) -> Frame:
     pose = metres_from_units.transform_pose(frame.world_from_camera)
     if not np.abs(pose.translation).max() <= MAX_COORDINATE_M:
         raise ValueError(f"{frame.name} would lie more than {MAX_COORDINATE_M:g} m from the origin")
-    return replace(frame, world_from_camera=pose)
+    depth = frame.depth and frame.depth.scaled(metres_from_units.scale)
+    return replace(frame, world_from_camera=pose, depth=depth)
 
 
 def _is_number(text: str) -> bool:

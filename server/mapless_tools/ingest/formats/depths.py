@@ -16,7 +16,7 @@ from mapless.cameras import camera_of_frame
 from mapless.depth import DepthImage, DepthNoise, DepthSensor
 from mapless.geometry import Camera, RigidTransform
 from mapless.lenses import DEFAULT_LENS_MODEL, lens_model_of
-from mapless_tools.dataset import DepthFile, finite_numbers, image_file, named
+from mapless_tools.dataset import DepthFile, finite_numbers, named, path_in
 
 FOLDER = "depth"
 """Where exports put them."""
@@ -30,7 +30,7 @@ def depth_of_frame(folder: Path, entry: Mapping[str, Any], beside: Mapping[str, 
         return None
     said = {**beside, **entry}
     with named("depth"):
-        path = _file(folder, entry["depth"])
+        path = path_in(folder, entry["depth"])
     with named("depth_unit_m"):
         unit_m = float(finite_numbers(said.get("depth_unit_m"), "it", ()))
     with named("depth_sensor"):
@@ -44,7 +44,7 @@ def depth_of_frame(folder: Path, entry: Mapping[str, Any], beside: Mapping[str, 
         _read(
             said, "camera_from_depth_camera", lambda it: RigidTransform.from_matrix(finite_numbers(it, "it", (4, 4)))
         ),
-        _read(said, "depth_confidence", lambda it: _file(folder, it)),
+        _read(said, "depth_confidence", lambda it: path_in(folder, it)),
         int(said.get("depth_min_confidence", 1)),
         _read(said, "depth_noise", lambda it: DepthNoise(**it)),
         _size(said, entry) if path.suffix == FLOAT32 else None,
@@ -76,12 +76,6 @@ def depth_name(image: str, depth: DepthImage) -> str:
 def confidence_name(name: str) -> str:
     """File name of the confidence of a depth, from the depth's."""
     return f"{name}.confidence.png"
-
-
-def _file(folder: Path, path: object) -> Path:
-    if not isinstance(path, str) or not path:
-        raise ValueError(f"must be a path, is {path!r}")
-    return image_file(folder, path)
 
 
 def _read(said: Mapping[str, Any], field: str, read: Callable[[Any], Any]) -> Any:

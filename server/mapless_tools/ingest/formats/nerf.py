@@ -4,7 +4,8 @@ Read are `frames`, each with `file_path` (with or without ending) and `transform
 OpenGL's camera axes); in a frame or for all, `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, `camera_angle_x`, `camera_angle_y`,
 `camera_model`, `is_fisheye`, k1 to k4, p1 and p2; and for all `applied_transform` and `applied_scale`, which are
 undone, and `train_filenames`, `val_filenames`, `test_filenames`. A frame's `mask_path` is its mask: black pixels are
-ignored, as in nerfstudio.
+ignored, as in nerfstudio. A frame's `depth_file_path` is its depth, of the same camera: a PNG of 16 bits in thousandths
+of the unit of the poses before `applied_scale`, nerfstudio's `depth_unit_scale_factor`.
 
 Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so principal points count from the corner.
 """
@@ -16,12 +17,14 @@ from typing import Any
 
 from mapless.geometry import Camera, RigidTransform, nearest_rotation
 from mapless.lenses import Distortion, Fisheye, RadialTangential
-from mapless_tools.dataset import Dataset, finite_numbers, named, read_json
+from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named, path_in, read_json
 
 from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of
 
 FILE_NAME = "transforms.json"
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "test", "transforms_test.json": "test"}
+DEPTH_UNIT = 0.001
+"""nerfstudio's `depth_unit_scale_factor`, if it is not set otherwise: millimetres."""
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 
 
@@ -61,7 +64,8 @@ def _read_file(file: Path, split: str, collector: Collector) -> None:
             pose = _world_from_camera(frame, scale, transform)
             camera = _camera(collector, image, content | frame)
             its_split = splits.get(str(frame["file_path"]), split)
-            collector.add(image, camera, pose, its_split, mask=frame.get("mask_path"))
+            depth = _depth(collector.folder, frame)
+            collector.add(image, camera, pose, its_split, mask=frame.get("mask_path"), depth=depth)
 
 
 def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
@@ -69,6 +73,13 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
     if not isinstance(path, str) or not path:
         raise ValueError("file_path must be a path")
     return collector.image(str(PurePosixPath(path))).relative_to(collector.folder).as_posix()
+
+
+def _depth(folder: Path, frame: Mapping[str, Any]) -> DepthFile | None:
+    if frame.get("depth_file_path") is None:
+        return None
+    with named("depth_file_path"):
+        return DepthFile(path_in(folder, frame["depth_file_path"]), DEPTH_UNIT)
 
 
 def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:

@@ -3,6 +3,9 @@
 Lines of rgb.txt are a time in seconds and an image's path; of groundtruth.txt a time and tx ty tz qx qy qz qw of
 world_from_camera, from motion capture at 100 Hz. A frame's pose is interpolated between the two before and after it.
 
+Lines of depth.txt, if there is one, are as of rgb.txt: PNGs of 16 bits, 5000 per metre, registered to the photographs.
+A photograph's depth is the nearest in time.
+
 The layout has no intrinsics: they are those published for the camera of freiburg1, 2 or 3, by the folder's
 name, or given. Images of freiburg3 are undistorted already.
 """
@@ -12,15 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
+from mapless.depth import DepthSensor
 from mapless.geometry import Array, Camera
 from mapless.lenses import RadialTangential
 from mapless_tools.bags.trajectory import Trajectory
-from mapless_tools.dataset import Dataset, finite_numbers, named
+from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named, path_in
 
 from .collecting import Collector, ReadOptions, filled_lines, size_of
 
 MAX_GAP_S = 0.02
-"""A frame without a pose this near, before and after, is refused: a hand-held camera moves centimetres in that time."""
+"""A frame without a pose this near, before and after, is refused: a hand-held camera moves centimetres in that time.
+Likewise the depth of a frame."""
+DEPTH_UNIT_M = 1 / 5000
 
 _LENSES = {
     "1": ((517.306408, 516.469215, 318.643040, 255.313989), (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),
@@ -45,6 +51,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         trajectory = Trajectory(rows, MAX_GAP_S)
     except ValueError as error:
         raise ValueError(f"{file} {error}") from error
+    depths = _Depths(path)
     for number, words in _lines(path / "rgb.txt"):
         with collector.attempt(f"rgb.txt:{number} ({words[-1]})"):
             if len(words) != 2:
@@ -58,8 +65,36 @@ def read(path: Path, options: ReadOptions) -> Dataset:
                 camera = lens
             else:
                 raise ValueError(f"image: is {size[0]}x{size[1]}, the known intrinsics are of 640x480")
-            collector.add(words[1], camera, trajectory.at(time_s), name=file.stem)
+            collector.add(words[1], camera, trajectory.at(time_s), name=file.stem, depth=depths.at(time_s))
     return collector.dataset(path.resolve().name, "tum", metric=True, source="TUM RGB-D", ground_truth="motion capture")
+
+
+class _Depths:
+    """Depths of a sequence by their times; none without a depth.txt."""
+
+    def __init__(self, folder: Path) -> None:
+        file = folder / "depth.txt"
+        self._folder = folder
+        self._paths: list[str] = []
+        times: list[float] = []
+        for number, words in _lines(file) if file.is_file() else []:
+            with named(f"{file}:{number}"):
+                if len(words) != 2:
+                    raise ValueError(f"expected a time and a path, found {len(words)} words")
+                times.append(float(finite_numbers(words[0], "time")))
+                self._paths.append(words[1])
+        self._times_s = np.array(times)
+
+    def at(self, time_s: float) -> DepthFile | None:
+        """The depth nearest to a time; None if none is within `MAX_GAP_S`. ValueError if it has no file."""
+        if not self._paths:
+            return None
+        nearest = int(np.argmin(np.abs(self._times_s - time_s)))
+        if abs(self._times_s[nearest] - time_s) > MAX_GAP_S:
+            return None
+        with named("depth"):
+            path = path_in(self._folder, self._paths[nearest])
+        return DepthFile(path, DEPTH_UNIT_M, DepthSensor.STRUCTURED_LIGHT)
 
 
 def _lens(path: Path) -> Camera:
