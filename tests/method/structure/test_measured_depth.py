@@ -44,7 +44,8 @@ def test_a_plane_has_its_depth_whatever_the_size_of_the_map(size: tuple[int, int
     found = MeasuredDepth(depth_camera, plane_map(depth_camera), NOISE).at_keypoints(view)
     assert np.isfinite(found.depth).all()
     np.testing.assert_allclose(error_of(found, view), 0, atol=1e-5)
-    np.testing.assert_allclose(found.relative_sigma, (0.001 + 0.002 * found.depth**2) / found.depth, rtol=1e-5)
+    noise = (0.001 + 0.002 * found.depth**2) / found.depth
+    np.testing.assert_allclose(found.relative_sigma, np.hypot(noise, 0.01), rtol=1e-5)
     assert (found.common_sigma, found.source) == (0.01, DepthSource.MEASURED)
 
 

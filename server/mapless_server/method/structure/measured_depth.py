@@ -7,6 +7,10 @@ hides the other.
 Between pixels the inverse depth is interpolated, which on a plane is linear in the image. Where it bends by more than
 the sensor's noise, or a pixel beside has no value, there is an edge, at which a keypoint may belong to either side: it
 has no depth.
+
+A sensor's calibration bends its space: depths that are near one another are wrong by a part of the common error that
+the common factor does not remove. So this error counts in each depth, too; else hundreds would weigh as independent
+ones, more than triangulated points.
 """
 
 from dataclasses import dataclass
@@ -42,7 +46,7 @@ class MeasuredDepth:
         seen = self if self.camera_from_depth_camera is None else self.seen_by(view.camera)
         pixels = seen.camera.project(view.camera.rays(view.features.pixels()))
         depth = _interpolated(_without_edges(seen.depth, self.noise), pixels)
-        sigma = self.noise.sigma_m(depth.astype(np.float64)) / depth
+        sigma = np.hypot(self.noise.sigma_m(depth) / depth, self.noise.common)
         return KeypointDepths(
             depth.astype(np.float32), sigma.astype(np.float32), self.noise.common, DepthSource.MEASURED
         )
