@@ -220,7 +220,7 @@ class LocalizationResult:
             refinement.
         used_intrinsics: the intrinsics with which it was computed; None of servers before 0.4.
         arbitrary_unit: whether lengths are in the scene's own, arbitrary unit, also where a name says metres.
-        scale_source: the basis of its lengths: "REFERENCES", or "NETWORK" for a single reference.
+        scale_source: the basis of its lengths: "REFERENCES", or for a single reference "NETWORK" or "DEPTH".
         pose_stage: "REFINED" or "INITIAL"; "COARSE" for an unverified pose, either of a call with `allow_coarse` that
             ran out of time, or the first of `localize_progressively` with it.
         inlier_count, match_count: number of 2D-3D matches that agree with the pose, and of all matches.
