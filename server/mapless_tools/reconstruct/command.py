@@ -43,12 +43,12 @@ def reconstruct_command(
     """
     from mapless_tools.usage import failures_end_command
 
-    from .cameras import LensOptions
-    from .folder import reconstruct_into
-    from .run import ReconstructOptions
-    from .sources import SourceOptions
-
     with failures_end_command(ValueError, interrupted="interrupted; run it again to go on"):
+        from .cameras import LensOptions
+        from .folder import reconstruct_into
+        from .run import ReconstructOptions
+        from .sources import SourceOptions
+
         *sources, out = paths
         wanted = SourceOptions(frames=frames, excluded=(out,))
         options = ReconstructOptions(part, features, LensOptions.of(lens or ()), world.options())

@@ -1,7 +1,9 @@
 """Sources to a folder of photographs with poses, as the commands do it."""
 
+import errno
 import fcntl
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +17,7 @@ from .sources import SourceOptions, read_sources
 from .world.checking import check_files, check_names
 
 LOCK = "lock"
+_FULL_BYTES = 2**20
 
 
 def reconstruct_into(sources: Sequence[Path], out: Path, wanted: SourceOptions, options: ReconstructOptions) -> None:
@@ -22,7 +25,7 @@ def reconstruct_into(sources: Sequence[Path], out: Path, wanted: SourceOptions, 
     check_files(options.world)
     with terminable(), progress_bars() as progress:
         work = prepare(sources, out)
-        with locked(work, out):
+        with locked(work, out), _full_disk_named(out):
             pictures = read_sources(sources, work / "pictures", wanted, progress)
             check_names(options.world, pictures)
             result = reconstruct(pictures, work, options, progress)
@@ -48,3 +51,15 @@ def locked(work: Path, out: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def _full_disk_named(out: Path) -> Iterator[None]:
+    """Raises OSError with a sentence where a disk is full; SQLite within pycolmap says it in other words."""
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        is_full = isinstance(error, OSError) and error.errno == errno.ENOSPC
+        if is_full or shutil.disk_usage(out).free < _FULL_BYTES:
+            raise OSError(f"the disk of {out} is full: free some of it, and run it again to go on") from error
+        raise

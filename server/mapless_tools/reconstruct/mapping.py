@@ -21,9 +21,10 @@ from .turning import only_turned
 FEWEST = 3
 """Photographs of a part: with two nothing confirms their poses."""
 PARALLAX_DEG = 1.5
-"""Least angle at a point between two photographs, for half of the points: below, distances are not determined."""
-FEWEST_MATCHES = 15
-"""Matches of two photographs that agree; pycolmap's."""
+"""Least angle at a point between two photographs, for half of the points: below, distances are not determined.
+Evidence: parallax."""
+FEWEST_MATCHES = pycolmap.IncrementalPipelineOptions().min_num_matches
+"""Matches of two photographs that agree, with which the mapper uses a pair."""
 _NO_PARALLAX = frozenset(
     int(it)
     for it in (
@@ -99,7 +100,7 @@ def read_parts(
     models = [pycolmap.Reconstruction(str(it)) for it in sorted(folder.iterdir(), key=lambda it: int(it.name))]
     enough = [it for it in models if it.num_reg_images() >= FEWEST]
     moved = [it for it in enough if not only_turned(database, it.reg_image_ids())]
-    parts = [_part(it, by_name, evidence) for it in moved if _parallax_deg(it) >= PARALLAX_DEG]
+    parts = [_part(it, by_name, evidence) for it in moved if parallax_deg(it) >= PARALLAX_DEG]
     return tuple(sorted(parts, key=lambda it: -len(it.posed)))
 
 
@@ -184,7 +185,7 @@ def _colours(model: pycolmap.Reconstruction, points: Sequence[pycolmap.Point3D],
     return np.asarray(sums / np.maximum(counts, 1)[:, None])
 
 
-def _parallax_deg(model: pycolmap.Reconstruction) -> float:
+def parallax_deg(model: pycolmap.Reconstruction) -> float:
     """The median over points of the largest angle between two photographs that see it; 0 without points."""
     centres = {it.image_id: it.projection_center() for it in model.images.values() if it.has_pose}
     angles = []

@@ -195,7 +195,8 @@ def made_once(result: Path) -> Iterator[Path | None]:
         yield None
         return
     partial = result.with_name(f".{result.name}.partial")
-    remove(partial)
+    for stale in result.parent.glob(f"{partial.name}*"):  # also the log that SQLite keeps beside a database
+        remove(stale)
     yield partial
     partial.replace(result)
 

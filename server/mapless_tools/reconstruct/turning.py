@@ -18,7 +18,7 @@ from mapless.geometry import Array
 TURN_SHARE = 0.002
 """Largest distance of matches from where a turn moves them, over the longer side: 2 px of 1024, twice their noise."""
 PARALLAX_SHARE = 0.25
-"""Least share of pairs whose matches are farther off."""
+"""Least share of pairs whose matches are farther off. Evidence: parallax."""
 _MATCHES, _PAIRS = 100, 150
 _MIN_MATCHES = 15
 _FACTORS, _RADIAL = (0.4, 0.55, 0.75, 1.0, 1.35, 1.8, 2.5), 0.5
@@ -27,9 +27,14 @@ _FACTORS, _RADIAL = (0.4, 0.55, 0.75, 1.0, 1.35, 1.8, 2.5), 0.5
 
 def only_turned(database: Path, image_ids: Collection[int]) -> bool:
     """Whether turns alone explain the matches of pairs of some images of a database."""
+    return share_with_parallax(database, image_ids) < PARALLAX_SHARE
+
+
+def share_with_parallax(database: Path, image_ids: Collection[int]) -> float:
+    """The share of pairs of some images of a database whose matches no turn explains; 1 without pairs."""
     pairs = _pairs(database, frozenset(image_ids))
     if not len(pairs):
-        return False
+        return 1.0
 
     def off(unknowns: NDArray[np.float64]) -> Array:
         return _off_turn(pairs, float(np.exp(unknowns[0])), float(unknowns[1]))
@@ -43,7 +48,7 @@ def only_turned(database: Path, image_ids: Collection[int]) -> bool:
     found = minimize(
         cost, [start, 0.0], method="Nelder-Mead", bounds=bounds, options={"maxiter": 80, "initial_simplex": simplex}
     )
-    return float((off(found.x) > TURN_SHARE).mean()) < PARALLAX_SHARE
+    return float((off(found.x) > TURN_SHARE).mean())
 
 
 def _pairs(database: Path, image_ids: Collection[int]) -> Array:

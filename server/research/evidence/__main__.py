@@ -27,6 +27,7 @@ MODULES = {
     "worth": ("rungs-worth", "place-agreement"),
     "any_roll": ("any-roll-pixels",),
     "mask_margin": ("mask-margin",),
+    "parallax": ("parallax",),
     "scene_agreement": ("scene-agreement",),
     "rungs": ("rungs",),
     "readings": ("readings", "suspects"),
