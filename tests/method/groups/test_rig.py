@@ -11,11 +11,12 @@ from support.compare import assert_jacobian, assert_pose_close
 from support.groups import NOTHING, caller_pose, images_of, looking
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
-from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
+from mapless.geometry import Array, Camera, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.bundle.estimate import PoseStage
-from mapless_server.method.bundle.priors import PositionPrior, Priors
+from mapless_server.method.bundle.intrinsics import read_as
+from mapless_server.method.bundle.priors import IntrinsicsSigma, PositionPrior, Priors
 from mapless_server.method.groups.checks import check_mounting, check_tracking, check_unit, hinted_group
-from mapless_server.method.groups.images import rejection_without_matches
+from mapless_server.method.groups.images import GroupImage, rejection_without_matches
 from mapless_server.method.groups.jumps import Jump
 from mapless_server.method.groups.rig import RigEstimate, RigState, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate
@@ -26,6 +27,7 @@ from mapless_server.method.pose.generalized import CameraMatches, inlier_count, 
 from mapless_server.method.pose.pnp import PnpOptions
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.method.structure.model import MetricScale, PixelPoints, ScaleStage
+from mapless_server.method.unknown_camera import scaled
 
 WORLD_FROM_RIG = RigidTransform(rotation_from_vector([0.1, 0.2, -0.1]), np.array([0.3, 0.1, -3.8]))
 CAMERAS = looking((-0.5, 0, -4), (0.2, -0.1, -4.2), (0.6, 0.2, -3.9))
@@ -84,6 +86,30 @@ def test_a_prior_on_one_camera_is_used_for_the_rig() -> None:
     found = estimate(solve_rig([images[0], replace(images[1], priors=prior), images[2]], RIG_FROM_CAMERA))
     assert [(it.used, it.conflict) for it in found.prior_checks[1]] == [(True, False)]
     assert np.linalg.norm(found.world_from_rig.compose(RIG_FROM_CAMERA[1]).translation - at) < 1e-3
+
+
+def test_the_covariance_contains_what_a_common_focal_length_does() -> None:
+    """The focal length of all cameras is off by one standard deviation, which is theirs together or of each."""
+    images, sigma = images_of(random_for("focal"), CAMERAS), IntrinsicsSigma(0.01, 1e-6, 1e-6)
+    off = [_read_as(it, scaled(CAMERA, 0.01)) for it in images]
+    right, moved, known = (
+        estimate(solve_rig(it, RIG_FROM_CAMERA))
+        for it in (images, off, [replace(it, intrinsics=sigma) for it in images])
+    )
+    shift = moved.world_from_rig.translation - right.world_from_rig.translation
+    added = known.covariance - right.covariance
+    assert np.linalg.norm(shift) > 3 * np.sqrt(np.trace(right.covariance[:3, :3]))
+    np.testing.assert_allclose(added[:3, :3], np.outer(shift, shift), atol=0.3 * float(shift @ shift))
+    each = [replace(it, intrinsics=replace(sigma, k1=k1)) for it, k1 in zip(images, (1e-6, 2e-6, 3e-6), strict=True)]
+    apart = estimate(solve_rig(each, RIG_FROM_CAMERA)).covariance - right.covariance
+    assert 0 < np.trace(apart[:3, :3]) < np.trace(added[:3, :3])
+
+
+def _read_as(image: GroupImage, camera: Camera) -> GroupImage:
+    support = image.answer.support
+    assert support is not None
+    support = replace(support, query=read_as(support.query, camera))
+    return replace(image, answer=replace(image.answer, support=support))
 
 
 def test_a_blank_image_has_no_effect() -> None:
