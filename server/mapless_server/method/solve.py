@@ -27,7 +27,7 @@ from .judge.two_view import (
 )
 from .options import DoubtOptions, Variant
 from .pipeline import Coarse, structure_and_matches, unverified, wide_correspondences, with_wide_correspondences
-from .pose.one_reference import FIRST_DEPTH_SIGMA, MatchedDepths, solve_one_reference
+from .pose.one_reference import MatchedDepths, solve_one_reference
 from .pose.pnp import gate_failure, solve_pose
 from .pose.two_view import TwoViewOptions, solve_two_view
 from .rejection import Rejection, RejectionReason
@@ -144,7 +144,7 @@ def _depths_of_matches(coarse: Coarse, scale: MetricScale, reference: PosedView,
     assert isinstance(coarse.reconstruction, Reconstruction)
     (predicted,), view = coarse.reconstruction.references, reference.view
     depth = scale.metres_per_unit * predicted.depth_at(view.features.pixels(matches[:, 1]), view.camera)
-    return MatchedDepths(depth, FIRST_DEPTH_SIGMA, scale.relative_sigma)
+    return MatchedDepths(depth, None, scale.relative_sigma)
 
 
 def _from_lines(coarse: Coarse) -> Answer:

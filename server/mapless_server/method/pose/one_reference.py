@@ -6,8 +6,8 @@ whose error moves its projection along the epipolar line, so the covariance of a
 
     sigma^2 I + s_d^2 j j^T,    j the derivative of the projection by the logarithm of the depth,
 
-where sigma and s_d, the errors of keypoints and of single depths, are estimated from the residuals. Where these do not
-show the errors of depths, because the step is small, they are as stated. An error that all depths share, of the
+where sigma and s_d, the errors of keypoints and of single depths, are estimated from the residuals. Those of depths are
+at least as stated, and as stated where the step is too small to show them. An error that all depths share, of the
 sensor's or the network's metre, changes no residual: it moves the camera along the step, and the covariance of the pose
 contains it as s^2 d d^T, with d the step and s its relative standard deviation. Neither do errors of the reference's
 pose, whose usual size the covariance contains.
@@ -64,12 +64,12 @@ class MatchedDepths:
 
     Attributes:
         depth: (M,) in the unit of the reference's pose; NaN where unknown.
-        sigma: relative standard deviation of a depth.
+        sigma: relative standard deviation of a depth; None if it is not stated.
         common_sigma: relative standard deviation of the factor that they share.
     """
 
     depth: Array
-    sigma: float
+    sigma: float | None
     common_sigma: float
 
 
@@ -140,7 +140,7 @@ class _Problem:
 
     seen: PixelPoints
     reference_centre: Array
-    depth_sigma: float
+    depth_sigma: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,8 +232,9 @@ def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
     return _Solved(pose, distance < INLIER_SIGMA, distance * sigma_px, sigma_px, depth_sigma)
 
 
-def _noise(rows: _Rows, inliers: NDArray[np.bool_], stated_sigma: float) -> tuple[float, float]:
-    """Standard deviations of keypoints across the epipolar lines, and of depths along them."""
+def _noise(rows: _Rows, inliers: NDArray[np.bool_], stated_sigma: float | None) -> tuple[float, float]:
+    """Standard deviations of keypoints across the epipolar lines, and of depths along them, at least as stated."""
+    least = max(stated_sigma or 0.0, MIN_DEPTH_SIGMA)
     residual, by_depth = rows.residual[inliers], rows.by_depth[inliers]
     length = np.linalg.norm(by_depth, axis=1)
     direction = by_depth / np.maximum(length, 1e-9)[:, None]
@@ -242,12 +243,12 @@ def _noise(rows: _Rows, inliers: NDArray[np.bool_], stated_sigma: float) -> tupl
     # Errors of depth show only where they move a projection by more than a keypoint errs.
     shows = length * MAX_DEPTH_SIGMA > INLIER_SIGMA * sigma_px
     if shows.sum() < MIN_INLIERS:
-        return sigma_px, float(np.clip(stated_sigma, MIN_DEPTH_SIGMA, MAX_DEPTH_SIGMA))
+        return sigma_px, min(least if stated_sigma else FIRST_DEPTH_SIGMA, MAX_DEPTH_SIGMA)
     along = (direction * residual).sum(axis=1)[shows]
     spread = MAD_TO_SIGMA * float(np.median(np.abs(along / length[shows])))
     from_pixels = float(np.median(sigma_px / length[shows]))
     depth_sigma = float(np.sqrt(max(0.0, spread**2 - from_pixels**2)))
-    return sigma_px, float(np.clip(depth_sigma, MIN_DEPTH_SIGMA, MAX_DEPTH_SIGMA))
+    return sigma_px, float(np.clip(depth_sigma, least, MAX_DEPTH_SIGMA))
 
 
 def _covariance(problem: _Problem, solved: _Solved) -> Array:
