@@ -74,7 +74,7 @@ class Reconstructed:
 
 def reconstruct(pictures: Pictures, work: Path, options: ReconstructOptions, progress: Progress) -> Reconstructed:
     """Computes poses; ValueError says why there are none."""
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value  # our own sentence says why
     chosen = pictures.chosen
     if len(chosen) < FEWEST:
         notes = "".join(f" ({it})" for it in pictures.notes)
