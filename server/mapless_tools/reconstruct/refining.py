@@ -87,4 +87,4 @@ def _apply_prior(camera: pycolmap.Camera, covariance: Array) -> None:
     expected = np.array([camera.width / 2, camera.height / 2, 0.0, 0.0])
     prior = np.diag([side, side, *COEFFICIENTS]) ** 2
     gain = covariance[:, rows] @ np.linalg.inv(covariance[np.ix_(rows, rows)] + prior)
-    camera.params = camera.params + gain @ (expected - camera.params[rows])
+    camera.params = (camera.params + gain @ (expected - camera.params[rows])).tolist()

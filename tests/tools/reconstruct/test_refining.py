@@ -27,11 +27,12 @@ def model() -> pycolmap.Reconstruction:
     made = pycolmap.synthesize_dataset(options)
     pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=0.5), made)
     camera = _camera(made)
-    camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, np.array([930.0, 512.0, 384.0, 0.0])
+    camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [930.0, 512.0, 384.0, 0.0]
     return made
 
 
 def _camera(model: pycolmap.Reconstruction) -> pycolmap.Camera:
+    camera: pycolmap.Camera
     (camera,) = model.cameras.values()
     return camera
 
