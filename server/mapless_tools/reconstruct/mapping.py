@@ -25,6 +25,9 @@ PARALLAX_DEG = 1.5
 Evidence: parallax."""
 FEWEST_MATCHES = pycolmap.IncrementalPipelineOptions().min_num_matches
 """Matches of two photographs that agree, with which the mapper uses a pair."""
+_LONGEST = 2.0
+"""Largest focal length that is found, over that of the longest lens to begin with: with no bound, strong distortion is
+explained by one of several times its length."""
 _NO_PARALLAX = frozenset(
     int(it)
     for it in (
@@ -76,6 +79,7 @@ def map_incrementally(
         num_threads=threads,
         random_seed=SEED,
         constant_cameras=set(known),
+        max_focal_length_ratio=_LONGEST * _longest_focal_ratio(database),
     )
     token = pycolmap.CancellationToken()
     interruptible(
@@ -90,6 +94,12 @@ def map_globally(database: Path, folder: Path, threads: int) -> None:
     """Runs pycolmap's global mapper."""
     options = pycolmap.GlobalPipelineOptions(min_model_size=FEWEST, num_threads=threads, random_seed=SEED)
     interruptible(lambda: pycolmap.global_mapping(database, database.parent, folder, options))
+
+
+def _longest_focal_ratio(database: Path) -> float:
+    """The largest focal length of the cameras of a database over the longer side."""
+    with pycolmap.Database.open(database) as content:
+        return max(it.mean_focal_length() / max(it.width, it.height) for it in content.read_all_cameras())
 
 
 def read_parts(
