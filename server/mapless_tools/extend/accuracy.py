@@ -15,18 +15,20 @@ import numpy as np
 import pycolmap
 
 from mapless import Accuracy
-from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless.geometry import RigidTransform, rotation_angle_deg
 from mapless.provenance import Provenance
 from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_tools.progress import Progress, tracked
 
-from .model import Estimate, Fixed, adjusted, without
+from .model import Estimate, Fixed, adjusted, posed_images, with_free_lenses, without
 
-FOLDS = 4
+FOLDS = 3
 """Groups of references, one of which is placed by the others at a time."""
-USUAL_POSITION, USUAL_ROTATION, USUAL_COUNT = 3.0, 6.0, 4
+MOST = 24
+"""References that are placed, at most."""
+USUAL_POSITION, USUAL_ROTATION, USUAL_COUNT = 3.0, 8.0, 4
 """Factors where there are no references to measure them by, and how many of these weigh as much: of five scenes the
-factors were 1 to 6 and 2 to 17."""
+factors were 1 to 8 and 2 to 23."""
 FEWEST_LEFT = 2
 """References that stay fixed."""
 
@@ -41,16 +43,27 @@ class Factors:
 
 
 def measured_factors(
-    model: pycolmap.Reconstruction, fixed: Fixed, names: Sequence[str], threads: int, progress: Progress
+    model: pycolmap.Reconstruction,
+    fixed: Fixed,
+    names: Sequence[str],
+    unknown_cameras: bool,
+    threads: int,
+    progress: Progress,
 ) -> Factors:
-    """Places the references of these names, group by group, by all others, and compares."""
+    """Places references of these names, group by group, by all others, and compares.
+
+    Each reference has a camera of its own in the model; with `unknown_cameras`, they are estimated with the poses.
+    """
+    names = names[:: 1 + (len(names) - 1) // MOST]
     groups = [names[i::FOLDS] for i in range(FOLDS)]
     groups = [it for it in groups if it and len(fixed.poses) - len(it) >= FEWEST_LEFT]
-    ratios: list[tuple[float, float]] = []
+    cameras = {it.name: it.camera_id for it in posed_images(model)}
+    ratios = []
     for group in tracked("accuracy", groups, len(groups), progress):
-        _, estimates, _ = adjusted(model, without(fixed, group), threads)
+        ids = [cameras[it] for it in group] if unknown_cameras else []
+        _, estimates = adjusted(with_free_lenses(model, ids), without(fixed, group, ids), threads)
         ratios += [_ratios(estimates[it], fixed.poses[it]) for it in group if it in estimates]
-    return _factors(np.array(ratios).reshape(-1, 2))
+    return _factors(ratios)
 
 
 def _ratios(estimate: Estimate, given: RigidTransform) -> tuple[float, float]:
@@ -60,10 +73,10 @@ def _ratios(estimate: Estimate, given: RigidTransform) -> tuple[float, float]:
     return off / radii.position_68_m, turned_deg / radii.rotation_68_deg
 
 
-def _factors(ratios: Array) -> Factors:
-    """Factors that 68 % of the ratios (N, 2) of position and rotation do not exceed, with what is usual."""
+def _factors(ratios: Sequence[tuple[float, float]]) -> Factors:
+    """Factors that 68 % of the ratios of position and rotation do not exceed, with what is usual."""
     count = len(ratios)
-    found = np.quantile(ratios, 0.68, axis=0) if count else np.zeros(2)
+    found = np.quantile(np.array(ratios), 0.68, axis=0) if count else np.zeros(2)
     usual = np.array([USUAL_POSITION, USUAL_ROTATION])
     mixed = np.sqrt((count * found**2 + USUAL_COUNT * usual**2) / (count + USUAL_COUNT))
     return Factors(float(mixed[0]), float(mixed[1]), count)

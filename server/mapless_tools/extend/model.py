@@ -16,11 +16,10 @@ from mapless_tools.reconstruct.native import interruptible
 
 LOSS_PX = 1.0
 """Scale of the Cauchy loss of the last adjustment: about the noise of a keypoint."""
-ITERATIONS, DECREASE = 50, 1e-6
+ITERATIONS, DECREASE = 50, 1e-5
 """Most steps of an adjustment, and the relative decrease of its cost at which it has converged."""
-SAME_CAMERA_COST = 1.03
-"""A camera is taken for the references' if the cost is no larger, as a share of that with a camera of its own. With the
-true camera it was 1.004 to 1.016, with focal lengths that differ by 0.2 % 1.04."""
+LENS_OBSERVATIONS = 300
+"""Fewest observations that determine focal lengths along both axes and tangential distortion."""
 
 
 @dataclass(frozen=True)
@@ -135,12 +134,13 @@ def pose_of(image: pycolmap.Image) -> RigidTransform:
 
 def adjusted(
     model: pycolmap.Reconstruction, fixed: Fixed, threads: int
-) -> tuple[pycolmap.Reconstruction, dict[str, Estimate], float]:
-    """A copy of a model after the adjustment of all that is not fixed; the poses that are not, by name; and its cost.
+) -> tuple[pycolmap.Reconstruction, dict[str, Estimate]]:
+    """A copy of a model after the adjustment of all that is not fixed, and the poses that are not, by name.
 
     Pixels are weighted with a Cauchy loss. A pose that the observations do not determine is left out.
     """
     model = pycolmap.Reconstruction(model)
+    _keep_seen(model, fixed)
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = LOSS_PX
@@ -154,8 +154,7 @@ def adjusted(
     for camera_id in fixed.cameras & set(model.cameras):
         config.set_constant_cam_intrinsics(camera_id)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    summary = interruptible(adjuster.solve)
-    assert isinstance(summary, pycolmap.CeresBundleAdjustmentSummary)
+    interruptible(adjuster.solve)
     of_poses = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POSES)
     found = interruptible(lambda: pycolmap.estimate_ba_covariance(of_poses, model, adjuster))
     variance = _variance_px2(model)
@@ -164,7 +163,15 @@ def adjusted(
         covariance = None if found is None else found.get_cam_cov_from_world(image.image_id)
         if covariance is not None and np.isfinite(covariance).all():
             estimates[image.name] = Estimate(pose_of(image), variance * _of_pose(image, covariance))
-    return model, estimates, float(summary.ceres_summary.final_cost)
+    return model, estimates
+
+
+def _keep_seen(model: pycolmap.Reconstruction, fixed: Fixed) -> None:
+    """Deletes the points that no photograph sees whose pose is not fixed."""
+    free = {it.image_id for it in posed_images(model) if it.name not in fixed.poses}
+    for point_id, point in list(model.points3D.items()):
+        if not any(it.image_id in free for it in point.track.elements):
+            model.delete_point3D(point_id)
 
 
 def _of_pose(image: pycolmap.Image, covariance: Array) -> Array:
@@ -180,32 +187,36 @@ def _variance_px2(model: pycolmap.Reconstruction) -> float:
     return float(2 / np.pi * model.compute_mean_reprojection_error() ** 2)
 
 
-def with_free_lenses(model: pycolmap.Reconstruction, fixed: Fixed) -> pycolmap.Reconstruction:
-    """A copy of a model whose unknown cameras have focal lengths along both axes and tangential distortion.
+def with_free_lenses(model: pycolmap.Reconstruction, camera_ids: Collection[int]) -> pycolmap.Reconstruction:
+    """A copy of a model in which cameras have what is refined of an unknown one.
 
-    With references fixed, few photographs determine them; a camera that is simpler than the true one turns and moves
-    all photographs by several times their errors.
+    That are focal lengths along both axes and tangential distortion, where there are observations enough: a camera that
+    is simpler than the true one turns and moves its photographs by several times their errors.
     """
     model = pycolmap.Reconstruction(model)
-    for camera_id, camera in model.cameras.items():
-        if camera_id not in fixed.cameras and camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL:
-            focal, x, y, k1 = camera.params.tolist()
-            camera.model = pycolmap.CameraModelId.OPENCV
-            camera.params = [focal, focal, x, y, k1, 0.0, 0.0, 0.0]
+    counts = dict.fromkeys(camera_ids, 0)
+    for image in posed_images(model):
+        if image.camera_id in counts:
+            counts[image.camera_id] += image.num_points3D
+    for camera_id, count in counts.items():
+        camera, model_ids = model.cameras[camera_id], pycolmap.CameraModelId
+        if camera.model not in (model_ids.SIMPLE_RADIAL, model_ids.PINHOLE):
+            continue
+        x, y = camera.principal_point_x, camera.principal_point_y
+        radial = float(camera.params[3]) if camera.model == model_ids.SIMPLE_RADIAL else 0.0
+        if count >= LENS_OBSERVATIONS:
+            focals = [camera.focal_length_x, camera.focal_length_y] if camera.model == model_ids.PINHOLE else []
+            focals = focals or [camera.focal_length] * 2
+            camera.model, camera.params = model_ids.OPENCV, [*focals, x, y, radial, 0.0, 0.0, 0.0]
+        else:
+            camera.model, camera.params = model_ids.SIMPLE_RADIAL, [camera.mean_focal_length(), x, y, radial]
     return model
 
 
-def with_camera(model: pycolmap.Reconstruction, camera_id: int, like: pycolmap.Camera) -> pycolmap.Reconstruction:
-    """A copy of a model in which a camera has the intrinsics of another one."""
-    model = pycolmap.Reconstruction(model)
-    camera = model.cameras[camera_id]
-    camera.model, camera.params = like.model, like.params.tolist()
-    return model
-
-
-def without(fixed: Fixed, names: Collection[str]) -> Fixed:
-    """What is known if the poses of some photographs are not."""
-    return Fixed({name: pose for name, pose in fixed.poses.items() if name not in names}, fixed.cameras)
+def without(fixed: Fixed, names: Collection[str], cameras: Collection[int] = ()) -> Fixed:
+    """What is known if the poses of some photographs and some cameras are not."""
+    poses = {name: pose for name, pose in fixed.poses.items() if name not in names}
+    return Fixed(poses, fixed.cameras - set(cameras))
 
 
 def depths_of(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,15 +20,12 @@ from mapless_tools.reconstruct.pictures import Omitted
 
 from .accuracy import Factors, accuracy_of, measured_factors
 from .model import (
-    SAME_CAMERA_COST,
-    Estimate,
     Fixed,
     adjusted,
     depths_of,
     pose_of,
     posed_images,
     references_seen,
-    with_camera,
     with_free_lenses,
 )
 from .options import ExtendOptions
@@ -50,11 +47,14 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Photographs that fit a scene, those that do not, each with the reason, and how radii were measured."""
+    """Photographs that fit a scene, those that do not, each with the reason, and how radii were measured.
+
+    That is for photographs with known cameras (False) and with unknown ones (True), as far as there are any.
+    """
 
     placed: tuple[Placed, ...]
     omitted: tuple[Omitted, ...]
-    factors: Factors | None
+    factors: Mapping[bool, Factors] = field(default_factory=dict)
 
 
 def place(
@@ -68,58 +68,35 @@ def place(
 ) -> Placement:
     """Adjusts a model, measures how accurate it is, and judges its photographs whose poses are not fixed."""
     pairs = _verified_pairs(database)
-    model, fixed, estimates = _with_cameras(model, fixed, threads)
-    new = [it for it in posed_images(model) if it.name not in fixed.poses]
+    refused = _left_out(model, pairs)
     known = [it for it in posed_images(model) if it.name in fixed.poses]
+    if len(known) == len(list(posed_images(model))):
+        return Placement((), tuple(Omitted(*it) for it in refused.items()))
+    unknown = {it.camera_id for it in posed_images(model)} - fixed.cameras
+    model = with_free_lenses(model, unknown)
     subjects = [it.name for it in known if it.num_points3D >= options.least_observations]
-    factors = measured_factors(model, fixed, subjects, threads, progress) if new else None
-    placed, refused = [], {}
-    for image in new:
+    kinds = {it.camera_id in unknown for it in posed_images(model) if it.name not in fixed.poses}
+    factors = {it: measured_factors(model, fixed, subjects, it, threads, progress) for it in sorted(kinds)}
+    model, estimates = adjusted(model, fixed, threads)
+    placed = []
+    for image in [it for it in posed_images(model) if it.name not in fixed.poses]:
         estimate, reason = estimates.get(image.name), _doubt(database, model, image, pairs, options)
-        if estimate is None or factors is None or reason:
+        if estimate is None or reason:
             refused[image.name] = reason or _UNDETERMINED
             continue
-        accuracy = accuracy_of(estimate, factors, references_seen(model, image, [*fixed.poses]), provenances)
+        shared = references_seen(model, image, [*fixed.poses])
+        accuracy = accuracy_of(estimate, factors[image.camera_id in unknown], shared, provenances)
         share = accuracy.position_95_m / float(np.median(depths_of(model, image)))
         if not share <= options.largest_radius:
             refused[image.name] = _UNCERTAIN.format(share=100 * share)
             continue
         camera = from_colmap(model.cameras[image.camera_id])
         placed.append(Placed(image.name, camera, estimate.world_from_camera, accuracy, image.num_points3D))
-    left_out = _left_out(database, model, fixed, pairs)
-    return Placement(tuple(placed), tuple(Omitted(*it) for it in (left_out | refused).items()), factors)
+    return Placement(tuple(placed), tuple(Omitted(*it) for it in refused.items()), factors)
 
 
 _UNDETERMINED = "its matches do not determine a pose"
 _UNCERTAIN = "its position is known to {share:.0f} % of the distance to what it shows only: too little for a reference"
-
-
-def _with_cameras(
-    model: pycolmap.Reconstruction, fixed: Fixed, threads: int
-) -> tuple[pycolmap.Reconstruction, Fixed, dict[str, Estimate]]:
-    """The adjusted model, in which cameras that are the references' by all that matches show are fixed, too."""
-    best, estimates, cost = adjusted(with_free_lenses(model, fixed), fixed, threads)
-    for camera_id, like in _alike(model, fixed).items():
-        same = Fixed(fixed.poses, fixed.cameras | {camera_id})
-        other, its_estimates, its_cost = adjusted(with_camera(best, camera_id, like), same, threads)
-        if its_cost <= SAME_CAMERA_COST * cost:
-            best, estimates, fixed = other, its_estimates, same
-    return best, fixed, estimates
-
-
-def _alike(model: pycolmap.Reconstruction, fixed: Fixed) -> dict[int, pycolmap.Camera]:
-    """For each unknown camera that of most references with photographs of its size, if there is one."""
-    counts: dict[int, int] = {}
-    for image in posed_images(model):
-        if image.name in fixed.poses:
-            counts[image.camera_id] = counts.get(image.camera_id, 0) + 1
-    found = {}
-    for camera_id in sorted(set(model.cameras) - fixed.cameras):
-        size = model.cameras[camera_id].width, model.cameras[camera_id].height
-        same = [it for it in counts if (model.cameras[it].width, model.cameras[it].height) == size]
-        if same:
-            found[camera_id] = model.cameras[max(same, key=lambda it: counts[it])]
-    return found
 
 
 def _verified_pairs(database: Path) -> dict[str, dict[str, int]]:
@@ -180,9 +157,7 @@ def _rays(model: pycolmap.Reconstruction, image: pycolmap.Image, keypoints: NDAr
     return np.hstack([plane, np.ones((len(plane), 1))])
 
 
-def _left_out(
-    database: Path, model: pycolmap.Reconstruction, fixed: Fixed, pairs: Mapping[str, Mapping[str, int]]
-) -> dict[str, str]:
+def _left_out(model: pycolmap.Reconstruction, pairs: Mapping[str, Mapping[str, int]]) -> dict[str, str]:
     """The photographs without a pose in a model, with the reasons."""
     posed = {it.name for it in posed_images(model)}
     return {

@@ -25,11 +25,11 @@ def lines(extension: Extension) -> Iterator[str]:
     for other in extension.omitted:
         name = other.name if other.count == 1 else f"{other.count} of {other.name}"
         yield f"{name}: {other.reason}" if is_there(other) else f"{name}: not placed, {other.reason}"
-    factors = extension.placement.factors
-    if factors is not None and factors.count:
+    for unknown, factors in extension.placement.factors.items():
+        cameras = "unknown" if unknown else "known"
         yield (
-            f"radii are measured on {factors.count} references that were placed by the others: {factors.position:.1f} "
-            f"times the residuals' for positions, {factors.rotation:.1f} times for rotations"
+            f"radii for {cameras} cameras are measured on {factors.count} references that were placed by the others: "
+            f"errors are {factors.position:.1f} times what residuals say, {factors.rotation:.1f} times for rotations"
         )
     tried = [it for it in extension.omitted if not is_there(it)]
     total = len(extension.placement.placed) + sum(it.count for it in tried)

@@ -16,7 +16,6 @@ import pycolmap
 
 from mapless import Client, Reference
 from mapless import Scene as KnownScene
-from mapless.geometry import Camera
 from mapless.provenance import PLACED, Provenance
 from mapless_server.choices import AUTO
 from mapless_server.method.bundle.priors import IntrinsicsSigma
@@ -67,7 +66,7 @@ def extend(
     check_scene(scene, references)
     new, there = _new_pictures(pictures.chosen, references)
     omitted, notes = [*pictures.omitted, *there], [*pictures.notes, *known.warnings]
-    placement = Placement((), (), None)
+    placement = Placement((), ())
     if new:
         wanted, alike = _similar(client, scene, new, len(references), options, progress)
         found, damaged = fetch_references(client, scene, work / "references", wanted, progress)
@@ -124,8 +123,9 @@ def placed_among(
 
     In a large scene, each is compared with the references that `alike` has for it. What takes long is kept in `work`.
     """
-    found_cameras = (_known_by_exif(it, new, found) for it in starting_cameras(new, options.reconstruct.lens))
-    cameras = [*_reference_cameras(found), *found_cameras]
+    cameras = _reference_cameras(found)
+    for it in starting_cameras(new, options.reconstruct.lens):
+        cameras += _apart(_known_by_exif(it, new, found), new)
     pictures = [*(it.picture for it in found), *new]
     choose = partial(pairs_with_references, count=len(found), alike=alike) if alike else pairs_of
     first = gather(pictures, options.reconstruct, work, progress, choose=choose)
@@ -162,11 +162,19 @@ def _of_evidence(
 
 
 def _reference_cameras(found: Sequence[KnownPicture]) -> list[StartingCamera]:
-    names: dict[Camera, list[str]] = {}
-    for it in found:
-        names.setdefault(it.camera, []).append(it.picture.name)
-    origin = "that of references"
-    return [StartingCamera(camera, tuple(its), origin, True, True) for camera, its in names.items()]
+    """A camera for each reference, since some are placed as if theirs was not known."""
+    return [StartingCamera(it.camera, (it.picture.name,), "that of the reference", True, True) for it in found]
+
+
+def _apart(start: StartingCamera, new: Sequence[Picture]) -> list[StartingCamera]:
+    """A camera for each photograph, unless it is known, or EXIF or a video says that they were taken with one.
+
+    Equal sizes alone do not: photographs that were zoomed, cropped or undistorted have them, too.
+    """
+    first = next(it for it in new if it.name in start.names)
+    if start.is_known or first.exif.optics or first.time is not None:
+        return [start]
+    return [replace(start, names=(name,)) for name in start.names]
 
 
 def _known_by_exif(start: StartingCamera, new: Sequence[Picture], found: Sequence[KnownPicture]) -> StartingCamera:
