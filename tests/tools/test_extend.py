@@ -123,7 +123,7 @@ def test_a_scene_with_too_little_is_refused(
 def test_factors_of_few_references_are_mostly_the_usual_ones() -> None:
     none = _factors([])
     assert (none.position, none.rotation, none.count) == pytest.approx((USUAL_POSITION, USUAL_ROTATION, 0))
-    many = _factors([(1.5, 1.5)] * 1000)
+    many = _factors([(1.5, 1.5)] * 5000)
     assert (many.position, many.rotation) == pytest.approx((1.5, 1.5), rel=0.05)
 
 

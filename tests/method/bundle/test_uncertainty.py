@@ -4,6 +4,7 @@ Many poses are solved, each with noise of its own, and the mean of their squared
 what was stated, position and rotation apart. With 20 poses the ratio of two standard deviations is known to an eighth.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from support.planted import (
 )
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
+from mapless.answers import Accuracy
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
 from mapless_server.method.bundle.adjust import adjust_pose, with_covariance
 from mapless_server.method.bundle.dispersion import (
@@ -228,12 +230,31 @@ def test_references_at_one_place_have_a_finite_covariance() -> None:
     assert np.linalg.eigvalsh(errors.covariance(0.1, 1.0)).min() > 0
 
 
-@pytest.mark.parametrize(("own", "drift"), [(0.05, 2.0), (0.8, 0.1), (0.4, 0.4)])
-def test_planted_sizes_are_found(own: float, drift: float) -> None:
-    """Within a factor of two, in the mean over gradients drawn from their distribution."""
+def test_a_stated_accuracy_adds_to_its_reference_alone() -> None:
+    centres, rotations, query, errors = planted("stated", 3)
+    unit_68 = float(error_radii(np.eye(3), 0.68))
+    accuracy = Accuracy(0.02 * unit_68, 1.0, math.degrees(0.003 * unit_68), 9.0)
+    stated = pose_errors(centres, rotations, query, LEVEL_PX, FOCAL_PX, DEPTH_M, stated=[None, accuracy, None])
+    added = stated.covariance(0.1, 0.4) - errors.covariance(0.1, 0.4)
+    variances = [0.0] * 6 + [0.02**2] * 3 + [0.003**2] * 3 + [0.0] * 6
+    np.testing.assert_allclose(added, np.diag(variances), atol=1e-15)
+
+
+PLACED = Accuracy(10 * LEVEL_PX / FOCAL_PX * DEPTH_M, 1.0, math.degrees(10 * LEVEL_PX / FOCAL_PX), 9.0)
+"""Ten times the structure's noise."""
+
+
+@pytest.mark.parametrize(("own", "drift", "placed"), [(0.05, 2.0, 0), (0.8, 0.1, 0), (0.4, 0.4, 0), (0.4, 0.4, 4)])
+def test_planted_sizes_are_found(own: float, drift: float, placed: int) -> None:
+    """Within a factor of two, in the mean over gradients drawn from their distribution; also beside placed references.
+
+    What these state of their errors is not taken for errors of the given poses.
+    """
     found = []
     for seed in range(20):
-        _, _, _, errors = planted(f"sizes {seed}", 10)
+        centres, rotations, query, _ = planted(f"sizes {seed}", 10)
+        stated = [*[PLACED] * placed, *[None] * (10 - placed)]
+        errors = pose_errors(centres, rotations, query, LEVEL_PX, FOCAL_PX, DEPTH_M, stated=stated)
         random = random_for("sizes", seed)
         unit = np.append(np.sqrt(np.diag(errors.own)), np.sqrt(np.diag(errors.own))[:6])
         factor = random.normal(0, 10, (200, len(unit))) / unit

@@ -15,7 +15,8 @@ the distance (the linear variogram: Matheron, Principles of geostatistics, 1963)
 
 in units of the structure's noise in the image (a shift by depth / focal length, or a rotation by 1 / focal length, for
 each pixel), where d is the median distance between two references that observe the points. So references near the query
-hold it, far ones hold little, and several far ones that are neighbours no more than one of them.
+hold it, far ones hold little, and several far ones that are neighbours no more than one of them. A reference whose pose
+has an accuracy of its own, as one that mapless placed, adds the variance that this states to C_ii.
 
 The sizes a and b are the most probable ones under the observations of the references. At the given poses, with points
 and query eliminated from the normal equations of the adjustment, the gradient g of the references' motions has the
@@ -30,6 +31,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from mapless.answers import Accuracy
 from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 
@@ -40,7 +42,7 @@ from ..structure.model import MIN_ADDED_SHARE, PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, free_problem
 from .dispersion import UncertaintyOptions, disperse, dispersed_covariance
-from .estimate import PoseEstimate, PoseStage, Support
+from .estimate import PoseEstimate, PoseStage, Support, accuracy_from_covariance
 from .intrinsics import (
     ContradictionOptions,
     IntrinsicsEvidence,
@@ -205,7 +207,8 @@ def pose_problem(
     observing = np.unique(tracks.view)[:-1]  # the last is the query
     focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
     centre, level_px, rotations = world_from_query.translation, structure.noise.level_px, problem.given.rotation
-    errors = pose_errors(centres, rotations, centre, level_px, focal_px, depth_m, observing)
+    stated = [it.provenance.accuracy for it in references]
+    errors = pose_errors(centres, rotations, centre, level_px, focal_px, depth_m, observing, stated)
     there = problem.at(start)
     matrix, gradient, _ = problem.linearize(there).reduced(LEAST_DAMPING)
     own, drift = most_probable(errors, matrix, gradient)
@@ -271,17 +274,20 @@ def errors_of_pose(
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """The two parts of the covariance of K references' errors, each (6 K, 6 K), with a = b = 1.
+    """The parts of the covariance of K references' errors, each (6 K, 6 K), the first two with a = b = 1.
 
-    The errors are left perturbations (v, w) of camera_from_world, metres and radians.
+    The errors are left perturbations (v, w) of camera_from_world, metres and radians. `stated` is None if no reference
+    has an accuracy of its own.
     """
 
     own: Array
     drift: Array
+    stated: Array | None = None
 
     def covariance(self, own: float, drift: float) -> Array:
         """The covariance C (6 K, 6 K) for sizes a = `own` and b = `drift`."""
-        return own**2 * self.own + drift**2 * self.drift
+        estimated = own**2 * self.own + drift**2 * self.drift
+        return estimated if self.stated is None else estimated + self.stated
 
 
 def pose_errors(
@@ -292,12 +298,14 @@ def pose_errors(
     focal_px: float,
     depth_m: float,
     observing: NDArray[np.intp] | None = None,
+    stated: Sequence[Accuracy | None] = (),
 ) -> PoseErrors:
-    """Computes the two parts of the covariance of the errors of K references.
+    """Computes the parts of the covariance of the errors of K references.
 
     Centres (K, 3) and (3,) of the query are in metres, rotations (K, 3, 3) are camera_from_world. `level_px` is the
     noise of the structure, `depth_m` the median depth of the points. References that are not `observing` points (None
-    for all) may be in another part of the scene, and do not count for d.
+    for all) may be in another part of the scene, and do not count for d. `stated` are the accuracies that references
+    have of their own, None for those without.
     """
     unit = level_px / focal_px * np.array([depth_m, 1.0])
     between = np.linalg.norm(centres[:, None] - centres, axis=2)
@@ -305,7 +313,21 @@ def pose_errors(
     distances = [between[i, j] for i, j in combinations(range(len(centres)) if observing is None else observing, 2)]
     spacing = max(float(np.median(distances)) if distances else 0.0, LEAST_SPACING * depth_m)
     drift = (to_query[:, None] + to_query - between) / (2 * spacing)
-    return PoseErrors(_of_motions(np.eye(len(centres)), rotations, unit), _of_motions(drift, rotations, unit))
+    own = _of_motions(np.eye(len(centres)), rotations, unit)
+    return PoseErrors(own, _of_motions(drift, rotations, unit), _stated(stated))
+
+
+def _stated(accuracies: Sequence[Accuracy | None]) -> Array | None:
+    """Covariance (6 K, 6 K) of errors as large along each axis as the radii of 68 % say; None without any."""
+    if not any(accuracies):
+        return None
+    unit = accuracy_from_covariance(np.eye(6))
+    ratios = [
+        (it.position_68_m / unit.position_68_m, it.rotation_68_deg / unit.rotation_68_deg) if it else (0.0, 0.0)
+        for it in accuracies
+    ]
+    variances = np.square(ratios)
+    return np.diag(np.repeat(variances, 3, axis=1).ravel())
 
 
 def _of_motions(covariance: Array, rotations: Array, unit: Array) -> Array:
@@ -325,11 +347,14 @@ def most_probable(errors: PoseErrors, matrix: Array, gradient: Array) -> tuple[f
         return OWN_INFLATION * USUAL_OWN, DRIFT_INFLATION * USUAL_DRIFT
     project, data = _whitened(*_without_query(matrix, gradient, len(errors.own)), np.sqrt(np.diag(errors.own)))
     own, drift = project @ errors.own @ project.T, project @ errors.drift @ project.T
+    noise = np.eye(len(data))
+    if errors.stated is not None:
+        noise += project @ errors.stated @ project.T
     sizes = np.array([(a, b) for a in OWN for b in DRIFT])
     squares = sizes[:, :, None, None] ** 2
     # The last row of a Cholesky factor [L 0; (L^-1 d)^T .] of the matrix bordered by d.
     bordered = np.empty((len(sizes), len(data) + 1, len(data) + 1))
-    bordered[:, :-1, :-1] = np.eye(len(data)) + squares[:, 0] * own + squares[:, 1] * drift
+    bordered[:, :-1, :-1] = noise + squares[:, 0] * own + squares[:, 1] * drift
     bordered[:, -1, :-1] = bordered[:, :-1, -1] = data
     bordered[:, -1, -1] = 1 + data @ data
     factor = np.linalg.cholesky(bordered)

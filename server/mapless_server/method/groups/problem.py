@@ -209,11 +209,13 @@ class GroupProblem(Generic[S]):
         size = block.level_px, focal_px, block.depth_m
         centre = bundle.world_from_query.translation
         its = given[block.references]
-        errors = pose_errors(its.centres, its.rotation, centre, *size, observing)
+        stated = [reference.provenance.accuracy for _, reference in self._references.values()]
+        its_stated = [stated[i] for i in block.references]
+        errors = pose_errors(its.centres, its.rotation, centre, *size, observing, its_stated)
         matrix, gradient, _ = block.problem.linearize(block.problem.at(bundle)).reduced(LEAST_DAMPING)
         own, drift = most_probable(errors, matrix, gradient)
         last = self.start.state.camera_from_world(self.blocks[-1].source.image).inverse().translation
-        errors = pose_errors(given.centres, given.rotation, last, *size, block.references[observing])
+        errors = pose_errors(given.centres, given.rotation, last, *size, block.references[observing], stated)
         return np.asarray(np.linalg.inv(errors.covariance(own, drift)), np.float64)
 
     def cost(self, point: Point[S]) -> float:
