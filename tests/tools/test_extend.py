@@ -91,6 +91,7 @@ def test_photographs_are_placed_where_they_were_taken(
     assert (report["stored"], report["arbitrary_unit"]) == ([it.name for it in NEW], True)
     again = extended(server, scene, photos)
     assert f"{NEW[0].name}: it is in the scene already, as reference {NEW[0].name}" in again.stdout
+    assert "0 of 1 photographs are placed" in again.stdout
     assert len(poses(client, scene)) == len(stored)
 
 

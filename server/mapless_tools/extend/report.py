@@ -33,7 +33,11 @@ def lines(extension: Extension) -> Iterator[str]:
         )
     tried = [it for it in extension.omitted if not is_there(it)]
     total = len(extension.placement.placed) + sum(it.count for it in tried)
-    yield f"{len(extension.placement.placed)} of {total} photographs are placed in scene {extension.scene.scene_id}"
+    scene = extension.scene.scene_id
+    if total:
+        yield f"{len(extension.placement.placed)} of {total} photographs are placed in scene {scene}"
+    else:
+        yield f"nothing to place: all photographs are in scene {scene} already"
 
 
 def is_there(omitted: Omitted) -> bool:
