@@ -301,7 +301,7 @@ def test_small_motions_of_halves_are_those_of_ransac(monkeypatch: pytest.MonkeyP
     scenes = [scene_of(case, outlier_share=0.3, noise_px=1.0) for case in range(5)]
     supports = [solved(scene) for scene in scenes]
     moved = [both(*it) for it in zip(scenes, supports, strict=True)]
-    monkeypatch.setattr("mapless_server.method.judge.evidence.MAJORITY", 1.0)
+    monkeypatch.setattr("mapless_server.method.judge.evidence.LEAST_AGREEING", 10**9)
     found = [both(*it) for it in zip(scenes, supports, strict=True)]
     assert moved != found
     np.testing.assert_allclose(moved, found, rtol=0.1, atol=2e-4)  # a thousandth counts as nothing

@@ -36,10 +36,6 @@ MOST_POINTS = 2000
 LEAST_SHARE, LEAST_HULL_SHARE, LEAST_EPIPOLAR_SHARE, LEAST_DISAGREEMENT = 0.01, 0.002, 0.0004, 0.001
 """Below these evidence is not better or worse."""
 
-MAJORITY = 0.5
-"""A majority: of a half's matches, which then lead to the pose that they agree with; of a pose's keypoints, of
-which another pose must explain as many to rival it; and of a rival's, those of references that agree with it more."""
-
 LEAST_AGREEING = 8
 """Where the majority of a half's matches agree with the pose, and so many, the half's own pose is near it."""
 
@@ -185,7 +181,7 @@ def _shifts_nearby(seen: PixelPoints, halves: NDArray[np.bool_], pose: RigidTran
     agrees: NDArray[np.bool_] = np.linalg.norm(residual, axis=1) < PNP.inlier_px
     in_half = halves[:, agrees]
     agreeing = in_half.sum(axis=1)
-    chosen: NDArray[np.bool_] = (agreeing >= LEAST_AGREEING) & (agreeing > MAJORITY * halves.sum(axis=1))
+    chosen: NDArray[np.bool_] = (agreeing >= LEAST_AGREEING) & (agreeing > halves.sum(axis=1) / 2)
     if not chosen.any():
         return shifts
     (x, y), (right, down) = pose_jacobian(seen.camera, x_in_camera[agrees]), residual[agrees].T

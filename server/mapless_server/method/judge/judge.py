@@ -40,7 +40,7 @@ from ..pose.one_reference import Found
 from ..pose.pnp import LN_10, MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .cameras import wrong_camera, wrong_intrinsics
-from .evidence import MAJORITY, Evidence, Votes, evidence_of, votes_of
+from .evidence import Evidence, Votes, evidence_of, votes_of
 from .references import disagreeing_references, supporters_of
 
 RIVAL_MIN_KEYPOINTS = 10
@@ -271,7 +271,7 @@ def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, Pos
     estimate, camera = support.estimate, support.query.camera
     errors_px = votes.seen.errors_px(estimate.world_from_camera)
     own = errors_px < RIVAL_PNP.inlier_px
-    wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(MAJORITY * votes.keypoint_count(own))))
+    wanted = max(RIVAL_MIN_KEYPOINTS, int(np.ceil(votes.keypoint_count(own) / 2)))
     candidates = _outliers(votes, own, ~(errors_px < INEXACT_INLIER_PX), len(support.references))
     if votes.keypoint_count(candidates) < wanted:
         return None
@@ -284,7 +284,7 @@ def find_rival(support: PosedSupport, votes: Votes) -> tuple[PoseHypothesis, Pos
         return None
     theirs = votes.seen.errors_px(pose) < RIVAL_PNP.inlier_px
     counts = [np.bincount(votes.reference[rows], minlength=len(support.references)) for rows in (own, theirs)]
-    if counts[1][counts[1] > counts[0]].sum() < MAJORITY * counts[1].sum():
+    if counts[1][counts[1] > counts[0]].sum() < counts[1].sum() / 2:
         return None
     names = [reference.name for reference in support.references]
     return (

@@ -29,9 +29,6 @@ EQUAL_SHARE, EQUAL_PX = 1.25, 0.1
 MOST_NAMED = 2
 """Explanations that are named together, of those that fit equally well."""
 
-_REFINEMENTS = 3
-"""Rounds in which the factor on focal lengths is found, to half a per cent."""
-
 
 @dataclass(frozen=True)
 class Explanation:
@@ -160,7 +157,7 @@ def best_scale(sample: PairSample, change: Callable[[PosedView, float], PosedVie
         return _score_with(sample, lambda view: change(view, scale))
 
     scales = FOCAL_SCALES
-    for _ in range(_REFINEMENTS):
+    for _ in range(3):  # finds the factor to half a per cent
         best = int(np.argmin([score_at(scale)[0] for scale in scales]))
         low, high = scales[max(best - 1, 0)], scales[min(best + 1, len(scales) - 1)]
         scale = float(scales[best])
