@@ -21,7 +21,7 @@ PRINCIPAL_SHARE = 0.01
 COEFFICIENTS = 0.3, 0.1
 """Standard deviations of the radial coefficients of lenses."""
 SIGMA_FACTOR = 3.0
-"""Principal points are so many standard deviations of independent noise off, measured on seven scenes (2 in the median,
+"""Principal points are so many standard deviations of independent noise off, measured on six scenes (2 in the median,
 5 by root mean square): errors of photographs of one camera are alike."""
 LOSS_PX = 1.0
 """Residuals above the noise of keypoints count less, by a Cauchy loss."""
