@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 from support.servers import CAMERA
 
-from mapless_server.engine.groups import PhotoGroup
+from mapless_server.engine.groups import GroupResult, PhotoGroup
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import PREPARE, Caller, Photo, Query, Result
 from mapless_server.engine.queue_engine import JOIN, QueueEngine
 from mapless_server.errors import DeadlineExceeded, NotFound, Overloaded, RequestError, Unavailable
-from mapless_server.method.options import LocalizeOptions
+from mapless_server.method.options import ChosenCamera, IntrinsicsSource, LocalizeOptions
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.rpc import Call
 from mapless_server.scenes import Cone, Narrowing
@@ -254,6 +254,18 @@ def test_a_search_elsewhere_that_fails_leaves_the_rejection(failure: RequestErro
         assert next(engine._numbers) > 3  # it was tried
 
     run(engine, work())
+
+
+def test_a_second_round_keeps_the_cameras_of_the_first() -> None:
+    chosen = ChosenCamera(CAMERA, None, IntrinsicsSource.ESTIMATED)
+
+    def results(*cameras: ChosenCamera | None) -> GroupResult:
+        of_nothing: Any = None
+        made = [Result(of_nothing, of_nothing, (), of_nothing, CAMERA, camera=it) for it in cameras]
+        return GroupResult(tuple(made), (0.0,) * 3, (0.0,) * 3, (0.0,) * 3)
+
+    later = results(None, None, chosen).read_as_in(results(chosen, None, None))
+    assert [it.camera for it in later.results] == [chosen, None, chosen]
 
 
 def test_a_photo_that_a_full_store_failed_is_tried_again() -> None:

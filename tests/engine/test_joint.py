@@ -36,7 +36,8 @@ def joint(
         matcher=SimpleNamespace(options=SimpleNamespace(guided_similarity=0.7)),
     )
     narrowing = SimpleNamespace(contradiction=lambda *_: "")
-    query = SimpleNamespace(options=SimpleNamespace(coverage=0.95), priors=NO_PRIORS, narrowing=narrowing)
+    options = SimpleNamespace(coverage=0.95, intrinsics=None)
+    query = SimpleNamespace(options=options, priors=NO_PRIORS, narrowing=narrowing)
     results = [
         SimpleNamespace(
             answer=it.answer,

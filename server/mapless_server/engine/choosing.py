@@ -86,8 +86,7 @@ def turned_by_gravity(search: Search, tier: Tier) -> Search:
     """The search with a photograph that has a gravity prior turned, by quarters, as most references are held.
 
     Their poses show how gravity lies in the rasters in which they were described; nearly all of a scene are held alike,
-    so a few show it. EXIF, where it says how the photograph was held, comes first. Features that match at any roll
-    need no turn.
+    so a few show it. EXIF that turns the photograph comes first. Features that match at any roll need no turn.
     """
     query, gravity = search.query, search.query.priors.gravity
     if gravity is None or tier.any_roll or upright_of(query.photo.image).clockwise_deg:

@@ -63,6 +63,12 @@ class GroupResult:
         queued_s, seconds = total(self.queued_s, later.queued_s), total(self.seconds, later.seconds)
         return GroupResult(results, queued_s, seconds, total(self.processor_s, later.processor_s))
 
+    def read_as_in(self, earlier: GroupResult) -> GroupResult:
+        """The results with the cameras of an earlier round, with which the photographs were read as given ones."""
+        pairs = zip(self.results, earlier.results, strict=True)
+        results = [replace(it, camera=it.camera or before.camera) for it, before in pairs]
+        return replace(self, results=tuple(results))
+
 
 class PhotoGroup:
     """The photographs of a call that are localized one by one.

@@ -36,8 +36,8 @@ class Photo:
     """An encoded image and its camera, perhaps with a mask of ignored pixels, a PNG; empty for none; and with depth.
 
     `field` is the image's path in the request, for error messages. `exif`, of a photograph without intrinsics, is what
-    its camera is chosen by; of `camera` then only the size is known. Where EXIF does not say how the camera was held,
-    features are found in the raster turned clockwise by `upright_deg`.
+    its camera is chosen by; of `camera` then only the size is known. Where EXIF does not turn it, features are found
+    in the raster turned clockwise by `upright_deg`.
     """
 
     image: bytes

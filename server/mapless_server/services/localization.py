@@ -299,6 +299,7 @@ async def localize_group(
         return group, outcome
     try:
         asked, again = await localize_with_cameras(engine, elsewhere, call, list_name)
+        again = again.read_as_in(group)
         found = await _posed(asked, again, pose)
     except RequestError:  # a failed attempt at a better answer must not cost the first one
         return group, outcome
