@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from . import wire
 from .geometry import Camera, RigidTransform
+from .lenses import lens_model_of
 from .v1 import geometry_pb2 as pb
 from .wire import FieldError, joined
 
@@ -126,18 +127,30 @@ class DepthImage:
         """Hash of all that it consists of, hexadecimal; equal depths have equal ones."""
         pose = self.camera_from_depth_camera
         description = {
-            "unit_m": self.unit_m,
+            "unit_m": float(self.unit_m),
             "size": self.size and list(self.size),
             "sensor": self.sensor.value,
-            "camera": self.camera and str(self.camera),
+            "camera": self.camera and _numbers_of(self.camera),
             "camera_from_depth_camera": pose and (pose.matrix().round(9) + 0.0).tolist(),
             "min_confidence": self.min_confidence,
-            "noise": self.noise and asdict(self.noise),
+            "noise": self.noise and {name: float(it) for name, it in asdict(self.noise).items()},
         }
         digest = hashlib.sha256(json.dumps(description).encode())
         for part in (self.data, self.confidence):
             digest.update(len(part).to_bytes(8, "little") + part)
         return digest.hexdigest()
+
+
+def _numbers_of(camera: Camera) -> dict[str, object]:
+    """The numbers of a camera by fixed names, which checksums that are stored contain."""
+    lens = camera.distortion
+    return {
+        "size_px": [camera.width_px, camera.height_px],
+        "focal_px": [float(camera.focal_x_px), float(camera.focal_y_px)],
+        "principal_px": [float(camera.principal_x_px), float(camera.principal_y_px)],
+        "lens": None if lens is None else lens_model_of(lens),
+        "coefficients": None if lens is None else [float(it) for it in vars(lens).values()],
+    }
 
 
 def depth_to_message(depth: DepthImage, field: str = "depth") -> pb.DepthImage:

@@ -50,6 +50,14 @@ def test_depths_that_differ_in_anything_have_other_hashes(change: dict[str, obje
     assert replace(FULL, **change).sha256 != FULL.sha256  # type: ignore[arg-type]
 
 
+def test_the_hash_is_of_numbers_whatever_their_type() -> None:
+    whole = Camera(320, 240, 285, 286, 160, 120, Fisheye(0, 0, 0, 0))
+    floats = Camera(320, 240, 285.0, 286.0, 160.0, 120.0, Fisheye(0.0, 0.0, 0.0, 0.0))
+    assert replace(FULL, camera=whole, unit_m=1).sha256 == replace(FULL, camera=floats, unit_m=1.0).sha256
+    pinhole = DepthImage(b"values", 0.001, camera=Camera(320, 240, 285, 286, 160, 120))
+    assert pinhole.sha256 == "b62b3e9db4d6f01ecbc3c400bf4abe3a2b2bdb6862b82749ff782379eb6ef09a", "it is stored"
+
+
 def extrinsics(x_m: float = 0.0, turn_rad: float = 0.0) -> pb.RigidTransform:
     pose = RigidTransform(rotation_from_vector([0, turn_rad, 0]), np.array([x_m, 0, 0]))
     return depth_to_message(replace(FULL, camera_from_depth_camera=pose)).camera_from_depth_camera

@@ -60,6 +60,8 @@ BAD = {
     "empty": (replace(DEPTH, data=b""), "DEPTH_NOT_PNG", ".png"),
     "cut": (replace(DEPTH, data=DEPTH.data[:-30]), "IMAGE_UNDECODABLE", ".png"),
     "a bomb": (replace(DEPTH, data=png(np.zeros((9000, 9000), np.uint16))), "IMAGE_TOO_LARGE", ".png"),
+    "many pixels": (replace(DEPTH, data=png(np.ones((1600, 2560), np.uint16))), "DEPTH_TOO_LARGE", ".png"),
+    "many values": (DepthImage.of_metres(np.ones((1600, 2560), np.float32)), "DEPTH_TOO_LARGE", ".float32"),
     "another aspect": (replace(DEPTH, data=png(np.ones((240, 240), np.uint16))), "DEPTH_SIZE", ".intrinsics"),
     "another camera": (replace(DEPTH, camera=Camera.centred(640, 480, 500.0)), "DEPTH_SIZE", ".intrinsics"),
     "confidence of another size": (

@@ -27,6 +27,7 @@ def read(path: Path, entry: dict[str, Any], beside: dict[str, Any]) -> Dataset:
         (path / folder).mkdir(exist_ok=True)
     (path / "images" / "1.png").write_bytes(encode(".png", textured(CAMERA.width_px, CAMERA.height_px)))
     (path / "depth" / "1.png").write_bytes(encode(".png", np.ones((60, 80), np.uint16)))
+    (path / "depth" / "1.f32").write_bytes(bytes(4 * CAMERA.width_px * CAMERA.height_px))
     (path / "cameras.json").write_text(json.dumps(content))
     return read_dataset(path)
 
@@ -61,6 +62,8 @@ def test_another_camera_has_its_own_size_and_pose(tmp_path: Path) -> None:
         ({"depth": 1}, "depth:"),
         ({"depth": "depth/1.png", "depth_unit_m": None}, "depth_unit_m:"),
         ({"depth": "depth/1.png", "depth_sensor": "sonar"}, "depth_sensor:"),
+        ({"depth": "depth/1.png", "depth_min_confidence": "much"}, "depth_min_confidence:"),
+        ({"depth": "depth/1.f32", "depth_width": 80.5}, "depth_width:"),
         ({"depth": "depth/1.png", "depth_K": 5}, "depth_K:"),
         ({"depth": "depth/1.png", "camera_from_depth_camera": [1, 2]}, "camera_from_depth_camera:"),
         ({"depth": "depth/1.png", "depth_noise": {"bias": 1}}, "depth_noise:"),
@@ -70,3 +73,9 @@ def test_another_camera_has_its_own_size_and_pose(tmp_path: Path) -> None:
 def test_a_wrong_field_is_named(tmp_path: Path, entry: dict[str, Any], field: str) -> None:
     with pytest.raises(ValueError, match=field):
         read(tmp_path, entry, ALL)
+
+
+def test_a_number_that_is_null_is_missing(tmp_path: Path) -> None:
+    entry = {"depth": "depth/1.f32", "depth_width": None, "depth_height": None, "depth_min_confidence": None}
+    found = depth_of(tmp_path, entry, ALL)
+    assert (found.size, found.min_confidence) == ((CAMERA.width_px, CAMERA.height_px), 1)

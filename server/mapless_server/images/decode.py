@@ -42,15 +42,16 @@ _MAX_UNENDED_PIXELS = 16_000_000  # are decoded four times
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """Limits of the images that are accepted; those of the sides are inclusive."""
+    """Limits of the images that are accepted; those of the sides are inclusive. No depth sensor has as many pixels."""
 
     max_bytes: int = 16 * 2**20
     max_pixels: int = 66_000_000
     min_side_px: int = 32
     max_side_px: int = 16384
+    max_depth_pixels: int = 4_000_000
 
 
-ANY_SIZE = ImageLimits(max_bytes=2**40, max_pixels=2**40, min_side_px=1, max_side_px=2**30)
+ANY_SIZE = ImageLimits(max_bytes=2**40, max_pixels=2**40, min_side_px=1, max_side_px=2**30, max_depth_pixels=2**40)
 """For images whose header alone is read, and for stored ones, which were accepted with the limits of their time."""
 
 

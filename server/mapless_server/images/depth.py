@@ -28,15 +28,17 @@ _SATURATED = 65535
 def check_depth(depth: DepthImage, photo: tuple[int, int], limits: ImageLimits, field: str = "depth") -> None:
     """Checks what a depth image says of itself, for a photograph of this size, (width, height) pixels.
 
-    InvalidArgument, naming the field, if the bytes are no PNG with one channel of 16 bits, too many, animated, or of
+    InvalidArgument, naming the field, if the bytes are no PNG with one channel of 16 bits, too large, animated, or of
     another size than the depth camera, or without one than the photograph's aspect; likewise its confidence, of 8 bits.
     """
-    path, size = f"{field}.png", depth.size
-    if size is None:
-        size = _checked_png(depth.data, 16, limits, path)
-    elif len(depth.data) > limits.max_bytes or size[0] * size[1] > limits.max_pixels:
+    path = f"{field}.png" if depth.size is None else f"{field}.float32"
+    size = depth.size or _checked_png(depth.data, 16, limits, path)
+    if size[0] * size[1] > limits.max_depth_pixels:
+        message = f"the depth is {size[0]}x{size[1]} pixels, at most {limits.max_depth_pixels} in all are accepted"
+        raise InvalidArgument(f"{message}: reduce it", reason="DEPTH_TOO_LARGE", field=path)
+    if len(depth.data) > limits.max_bytes:
         message = f"the depth has {len(depth.data)} bytes, at most {limits.max_bytes} are accepted"
-        raise InvalidArgument(message, reason="DEPTH_TOO_LARGE", field=f"{field}.float32")
+        raise InvalidArgument(message, reason="DEPTH_TOO_LARGE", field=path)
     camera = depth.camera
     if camera is not None and (camera.width_px, camera.height_px) != size:
         message = (
@@ -66,7 +68,7 @@ def decode_depth(
     check_depth(depth, photo, limits, field)
     if depth.size is None:
         steps = _decoded(depth.data, np.uint16, f"{field}.png")
-        values = np.where((steps == 0) | (steps == _SATURATED), np.nan, steps).astype(np.float32)
+        values = np.where((steps == 0) | (steps == _SATURATED), np.float32(np.nan), steps.astype(np.float32))
     else:
         values = np.frombuffer(depth.data, "<f4").reshape(depth.size[::-1])
         if (values < 0).any():

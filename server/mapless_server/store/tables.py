@@ -112,7 +112,7 @@ def _encoded(table: str, kind: str, length: int) -> Table:
 # Images, masks, depth and features have tables of their own, so that listing references does not read their bytes.
 image = Table("image", metadata, _reference_key(), _bytes())
 mask = Table("mask", metadata, _reference_key(), _bytes())
-depth = Table("depth", metadata, _reference_key(), _bytes())  # see codec.py
+depth = Table("depth", metadata, _reference_key(), _bytes())  # see depth_images.py
 features = _encoded("features", "extractor", 128)
 global_descriptor = _encoded("global_descriptor", "name", 128)
 # Depth that is kept with references, see depths.py; which references are done is in reference_matching.

@@ -249,3 +249,22 @@ def test_one_reference_with_depths_is_enough(source: DepthSource) -> None:
     assert along @ outcome.covariance[:3, :3] @ along > (0.02 * np.linalg.norm(step)) ** 2
     without = localize(SCENE.query, [replace(reference, depths=None)], Pipeline(), LocalizeOptions()).outcome
     assert not isinstance(without, Localization)
+
+
+def test_depths_that_share_no_factor_stay_as_they_are() -> None:
+    """A sigma of 0: the factor is known to be 1, whatever triangulated points say."""
+    reference = with_depths(0, noise=0.005, factor=1.05)
+    assert reference.depths is not None
+    references = (replace(reference, depths=replace(reference.depths, common_sigma=0.0)), *SCENE.references[1:])
+    structure, correspondences = matched(references)
+    kept = structure.tracks.select(np.arange(len(structure.x_in_world)) % 2 == 0)
+    half = replace(structure, x_in_world=structure.x_in_world[::2], tracks=kept)
+    found = with_kept_depths(half, references, correspondences, ALWAYS)
+    single = found.tracks.select(~found.triangulated)
+    of_first = single.view == 0
+    points = found.x_in_world[len(half.x_in_world) :][of_first]
+    seen = reference.world_from_camera.inverse().apply(points)[:, 2]
+    assert of_first.sum() > 50
+    np.testing.assert_allclose(seen, reference.depths.depth[single.keypoint[of_first]], rtol=1e-6)
+    assert found.planes is not None
+    assert not found.planes.common[~found.triangulated][of_first].any()

@@ -1,5 +1,7 @@
 """Measured depth at keypoints: planted planes and steps, seen by the same camera, a smaller one and another one."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -104,3 +106,12 @@ def test_a_lens_bends_the_map_as_the_photograph() -> None:
     error = error_of(MeasuredDepth(lens, depth, NOISE).at_keypoints(view), view)
     assert np.isfinite(error).mean() > 0.9
     assert np.nanmax(np.abs(error)) < 1e-3
+
+
+def test_only_the_surroundings_of_keypoints_are_computed() -> None:
+    depth, view = np.full((1920, 2000), 2.0, np.float32), view_of(CAMERA.resized(2000, 1920), 500)
+    tracemalloc.start()
+    MeasuredDepth(CAMERA.resized(2000, 1920), depth, NOISE).at_keypoints(view)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < depth.nbytes / 4

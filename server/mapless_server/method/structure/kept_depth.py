@@ -16,6 +16,7 @@ loss and a prior of its standard deviation. What is left of it moves all planes 
 pose's covariance contains (see `bundle.dispersion`). Points that are triangulated stay where they are.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -118,7 +119,8 @@ def _without_common_factors(structure: Structure, references: Sequence[PosedView
         seen = has_depth & (tracks.view == view)
         if reference.depths is None or not seen.any():
             continue
-        prior_information = reference.depths.common_sigma**-2
+        common_sigma = reference.depths.common_sigma
+        prior_information = common_sigma**-2 if common_sigma else math.inf
         own_variance = reference.depths.relative_sigma[tracks.keypoint[seen]].astype(np.float64) ** 2
         values, variance, common = log_factor[seen], own_variance + relative_variance[seen], 0.0
         for _ in range(ITERATIONS):

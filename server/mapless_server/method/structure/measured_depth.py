@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from mapless.depth import DepthNoise
@@ -45,7 +46,7 @@ class MeasuredDepth:
         """The depths at the keypoints of the photograph, with their standard deviations."""
         seen = self if self.camera_from_depth_camera is None else self.seen_by(view.camera)
         pixels = seen.camera.project(view.camera.rays(view.features.pixels()))
-        depth = _interpolated(_without_edges(seen.depth, self.noise), pixels)
+        depth = _depth_at(seen.depth, pixels, self.noise)
         sigma = np.hypot(self.noise.sigma_m(depth) / depth, self.noise.common)
         return KeypointDepths(
             depth.astype(np.float32), sigma.astype(np.float32), self.noise.common, DepthSource.MEASURED
@@ -77,35 +78,40 @@ class MeasuredDepth:
         return np.asarray(self.camera.rays(pixels) * self.depth[rows, columns, None].astype(np.float64))
 
 
-def _without_edges(depth: NDArray[np.float32], noise: DepthNoise) -> Array:
-    """Inverse depths (H, W); NaN without a value, at edges and beside them.
+def _depth_at(depth: NDArray[np.float32], pixels: Array, noise: DepthNoise) -> Array:
+    """Depths (N,) at pixels (N, 2) of a depth image; NaN where one of the four around has none or is at an edge."""
+    first = np.floor(np.where(np.isfinite(pixels), pixels, -6)).astype(np.intp)
+    right, low = (pixels - first).T
+    inverse = _without_edges(_patches(depth, first), noise)
+    upper = inverse[:, 0, 0] * (1 - right) + inverse[:, 0, 1] * right
+    lower = inverse[:, 1, 0] * (1 - right) + inverse[:, 1, 1] * right
+    return np.asarray(1 / (upper * (1 - low) + lower * low))
+
+
+def _patches(depth: NDArray[np.float32], first: NDArray[np.intp]) -> Array:
+    """Depths (N, 6, 6) around the upper left (column, row) of four pixels, which is at [2, 2]; NaN beyond the image.
+
+    The four depend on all of them: an edge beside a pixel is seen from its neighbours.
+    """
+    height, width = depth.shape
+    column, row = (first[:, axis, None] + np.arange(-2, 4) for axis in (0, 1))
+    inside = ((row >= 0) & (row < height))[:, :, None] & ((column >= 0) & (column < width))[:, None, :]
+    values = depth[np.clip(row, 0, height - 1)[:, :, None], np.clip(column, 0, width - 1)[:, None, :]]
+    return np.where(inside, values.astype(np.float64), np.nan)
+
+
+def _without_edges(patches: Array, noise: DepthNoise) -> Array:
+    """Inverse depths (N, 2, 2) of the four pixels amid patches; NaN without a value, at edges and beside them.
 
     The second difference of neighbours is 0 on a plane, but for noise: with the weights 1, -2 and 1 it has six
     times the variance of one of them. An edge is beyond three standard deviations.
     """
-    inverse = 1 / depth.astype(np.float64)
-    limit = 3 * np.sqrt(6) * noise.sigma_m(depth.astype(np.float64)) / depth
-    bend = np.zeros(inverse.shape, np.uint8)
-    across, down = inverse[:, 2:] + inverse[:, :-2], inverse[2:] + inverse[:-2]
-    bend[:, 1:-1] |= np.abs(across / inverse[:, 1:-1] - 2) > limit[:, 1:-1]
-    bend[1:-1] |= np.abs(down / inverse[1:-1] - 2) > limit[1:-1]
-    inverse[cv2.dilate(bend, np.ones((3, 3), np.uint8)) > 0] = np.nan
-    return inverse
-
-
-def _interpolated(inverse: Array, pixels: Array) -> Array:
-    """Depths (N,) at pixels (N, 2) of a map of inverse depths; NaN where one of the four pixels around has none."""
-    height, width = inverse.shape
-    first = np.floor(np.where(np.isfinite(pixels), pixels, -1)).astype(np.intp)
-    inside = np.asarray(((first >= 0) & (first < (width - 1, height - 1))).all(axis=1))
-    column, row = np.where(inside[:, None], first, 0).T
-    if not inside.any():
-        return np.full(len(pixels), np.nan)
-    right, low = (pixels - first).T
-    upper = inverse[row, column] * (1 - right) + inverse[row, column + 1] * right
-    lower = inverse[row + 1, column] * (1 - right) + inverse[row + 1, column + 1] * right
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(inside, 1 / (upper * (1 - low) + lower * low), np.nan))
+    inverse, inner = 1 / patches, patches[:, 1:-1, 1:-1]
+    limit = 3 * np.sqrt(6) * noise.sigma_m(inner) / inner
+    across, down = inverse[:, 1:-1, 2:] + inverse[:, 1:-1, :-2], inverse[:, 2:, 1:-1] + inverse[:, :-2, 1:-1]
+    bends = [np.abs(sums / inverse[:, 1:-1, 1:-1] - 2) > limit for sums in (across, down)]
+    near_edge = sliding_window_view(bends[0] | bends[1], (3, 3), axis=(1, 2)).any(axis=(-2, -1))
+    return np.where(near_edge, np.nan, inverse[:, 2:-2, 2:-2])
 
 
 def _filled(depth: Array) -> NDArray[np.float32]:

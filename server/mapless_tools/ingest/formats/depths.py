@@ -41,11 +41,9 @@ def depth_of_frame(folder: Path, entry: Mapping[str, Any], beside: Mapping[str, 
         unit_m,
         sensor,
         camera,
-        _read(
-            said, "camera_from_depth_camera", lambda it: RigidTransform.from_matrix(finite_numbers(it, "it", (4, 4)))
-        ),
+        _read(said, "camera_from_depth_camera", _pose),
         _read(said, "depth_confidence", lambda it: path_in(folder, it)),
-        int(said.get("depth_min_confidence", 1)),
+        _integer(said, "depth_min_confidence", 1),
         _read(said, "depth_noise", lambda it: DepthNoise(**it)),
         _size(said, entry) if path.suffix == FLOAT32 else None,
     )
@@ -93,7 +91,17 @@ def _pose(matrix: object) -> RigidTransform:
 
 
 def _size(said: Mapping[str, Any], entry: Mapping[str, Any]) -> tuple[int, int]:
-    return int(said.get("depth_width", entry["width"])), int(said.get("depth_height", entry["height"]))
+    return _integer(said, "depth_width", entry["width"]), _integer(said, "depth_height", entry["height"])
+
+
+def _integer(said: Mapping[str, Any], field: str, default: int) -> int:
+    """An integer, or the default if it is missing or null; ValueError, naming the field, for another value."""
+    value = said.get(field)
+    if value is None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise ValueError(f"{field}: must be an integer, is {value!r}")
+    return value
 
 
 def _camera(said: Mapping[str, Any]) -> Camera | None:
