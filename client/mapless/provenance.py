@@ -1,6 +1,5 @@
 """How the pose of a reference is known, as a value, a message and JSON."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +11,8 @@ from .wire import FieldError, joined
 
 GIVEN, PLACED, UNKNOWN = "GIVEN", "PLACED", "UNSPECIFIED"
 RADII = ("position_68_m", "position_95_m", "rotation_68_deg", "rotation_95_deg")
+LARGEST_M, LARGEST_DEG = 1000.0, 180.0
+"""Largest radii of a position and of a rotation."""
 _SOURCE: wire.ProtoEnum = pb.PoseSource
 
 
@@ -22,8 +23,8 @@ class Provenance:
     Attributes:
         source: "GIVEN" by the caller who stored it, or "PLACED" by mapless among the references that the scene had;
             "UNSPECIFIED" where a server before 0.4 answers.
-        accuracy: errors of the pose against the poses of the scene's other references; None if unknown, which it is not
-            for a reference that was placed.
+        accuracy: errors of the pose against the poses of the scene's other references, at most 1000 m and 180 degrees;
+            None if unknown, which it is not for a reference that was placed.
     """
 
     source: str = GIVEN
@@ -38,8 +39,9 @@ class Provenance:
         for name in RADII:
             radius = getattr(self.accuracy, name)
             least = least if "_95_" in name else 0.0
-            if not least <= radius < math.inf:
-                raise ValueError(f"accuracy.{name} must be finite and at least {least:g}, is {radius:g}")
+            most = LARGEST_M if name.endswith("_m") else LARGEST_DEG
+            if not least <= radius <= most:
+                raise ValueError(f"accuracy.{name} must be {least:g} to {most:g}, is {radius:g}")
             least = radius
 
 
@@ -73,8 +75,8 @@ def provenance_from_message(message: pb.Provenance, field: str) -> Provenance:
 
 
 def provenance_to_json(provenance: Provenance) -> dict[str, Any] | None:
-    """Provenance as JSON has it: `source` in small letters, and the radii; None for `GIVEN_POSE`."""
-    if provenance == GIVEN_POSE:
+    """Provenance as JSON has it: `source` in small letters, and the radii; None for `GIVEN_POSE` or an unknown source."""
+    if provenance == GIVEN_POSE or provenance.source not in (GIVEN, PLACED):
         return None
     accuracy = provenance.accuracy
     radii = {} if accuracy is None else {it: getattr(accuracy, it) for it in RADII}

@@ -38,8 +38,10 @@ def test_a_given_pose_may_have_an_accuracy(client: Client, scene: str) -> None:
         ({"position_95_m": 0.5}, "accuracy.position_95_m"),
         ({"rotation_68_deg": math.nan}, "accuracy.rotation_68_deg"),
         ({"rotation_95_deg": math.inf}, "accuracy.rotation_95_deg"),
+        ({"position_95_m": 1000.5}, "accuracy.position_95_m"),
+        ({"rotation_95_deg": 180.5}, "accuracy.rotation_95_deg"),
     ],
-    ids=["source", "missing", "negative", "smaller", "nan", "infinite"],
+    ids=["source", "missing", "negative", "smaller", "nan", "infinite", "1000 m", "180 degrees"],
 )
 def test_a_wrong_provenance_is_refused_by_field(
     stubs: Stubs, scene: str, wrong: pb.Provenance | dict[str, float], field: str

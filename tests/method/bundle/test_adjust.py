@@ -8,12 +8,20 @@ from support.compare import assert_jacobian, assert_pose_close, pose_error
 from support.planted import NOISE, disturbed, drifted, stages, true_correspondences, true_structure
 from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
+from mapless import Accuracy
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.bundle.adjust import adjust_pose
 from mapless_server.method.bundle.bundle import BundleProblem
 from mapless_server.method.bundle.estimate import PoseEstimate
 from mapless_server.method.bundle.normal_equations import Bundle
-from mapless_server.method.bundle.pose_problem import AdjustInput, AdjustOptions, optimum, pose_problem
+from mapless_server.method.bundle.pose_problem import (
+    AdjustInput,
+    AdjustOptions,
+    most_probable,
+    optimum,
+    pose_errors,
+    pose_problem,
+)
 from mapless_server.method.optim.optimize import MinimizeOptions, minimize
 from mapless_server.method.pose.pnp import PnpOptions, solve_pose
 from mapless_server.method.structure.model import PointMatches
@@ -143,6 +151,20 @@ def test_references_in_another_room_do_not_change_the_pose() -> None:
         for views in (references, (*references, *far))
     )
     assert_pose_close(beside.world_from_camera, alone.world_from_camera, metres=1e-6, degrees=1e-5)
+
+
+def test_sizes_of_errors_are_known_beside_unknown_poses() -> None:
+    """A reference that may be 1000 m off says as little of the others' errors as one that may be 1 m off."""
+    random, count, focal_px, depth_m = random_for("unknown poses"), 3, 1000.0, 0.01
+    centres, rotations = random.normal(0, depth_m, (count, 3)), np.stack([np.eye(3)] * count)
+    per_unit = np.tile([focal_px / depth_m] * 3 + [focal_px] * 3, count + 1)
+    jacobian = random.normal(size=(2000, len(per_unit))) * per_unit
+    residuals = jacobian @ (random.normal(size=len(per_unit)) / per_unit) + random.normal(size=len(jacobian))
+    sizes = []
+    for stated in (Accuracy(1.0, 1.0, 180.0, 180.0), Accuracy(1000.0, 1000.0, 180.0, 180.0)):
+        errors = pose_errors(centres, rotations, np.zeros(3), 1.0, focal_px, depth_m, None, [stated, None, stated])
+        sizes.append(most_probable(errors, jacobian.T @ jacobian, jacobian.T @ residuals))
+    assert sizes[0] == sizes[1]
 
 
 def test_a_rough_pose_converges_to_the_planted_one() -> None:

@@ -346,15 +346,16 @@ def most_probable(errors: PoseErrors, matrix: Array, gradient: Array) -> tuple[f
     if not finite:
         return OWN_INFLATION * USUAL_OWN, DRIFT_INFLATION * USUAL_DRIFT
     project, data = _whitened(*_without_query(matrix, gradient, len(errors.own)), np.sqrt(np.diag(errors.own)))
-    own, drift = project @ errors.own @ project.T, project @ errors.drift @ project.T
-    noise = np.eye(len(data))
     if errors.stated is not None:
-        noise += project @ errors.stated @ project.T
+        values, vectors = np.linalg.eigh(np.eye(len(data)) + project @ errors.stated @ project.T)
+        whiten = vectors.T / np.sqrt(np.maximum(values, 1.0))[:, None]  # below 1 is rounding
+        project, data = whiten @ project, whiten @ data
+    own, drift = project @ errors.own @ project.T, project @ errors.drift @ project.T
     sizes = np.array([(a, b) for a in OWN for b in DRIFT])
     squares = sizes[:, :, None, None] ** 2
     # The last row of a Cholesky factor [L 0; (L^-1 d)^T .] of the matrix bordered by d.
     bordered = np.empty((len(sizes), len(data) + 1, len(data) + 1))
-    bordered[:, :-1, :-1] = noise + squares[:, 0] * own + squares[:, 1] * drift
+    bordered[:, :-1, :-1] = np.eye(len(data)) + squares[:, 0] * own + squares[:, 1] * drift
     bordered[:, -1, :-1] = bordered[:, :-1, -1] = data
     bordered[:, -1, -1] = 1 + data @ data
     factor = np.linalg.cholesky(bordered)
