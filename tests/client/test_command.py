@@ -20,8 +20,9 @@ from support.servers import BLACK, CAMERA, PHOTO, RunningServer, pose
 from typer.testing import CliRunner
 
 import mapless
-from mapless import AlreadyExists, Camera, Client, NewReference, wire
+from mapless import AlreadyExists, Camera, Client, NewReference, Provenance, wire
 from mapless.cli.arguments import make_parser
+from mapless.cli.commands import _pose_of
 from mapless.cli.output import plain
 from mapless_tools.cli.app import app
 
@@ -153,6 +154,13 @@ def test_text_and_json_follow_one_rule(
         for command in commands:
             assert isinstance(run(*command)[1], str) == is_terminal, command
             assert isinstance(run(*command, flag)[1], str) != is_terminal, command
+
+
+@pytest.mark.parametrize(
+    ("source", "said"), [("GIVEN", "given"), ("UNSPECIFIED", "unknown"), ("7", "unknown")], ids=["given", "old", "new"]
+)
+def test_only_a_given_pose_is_called_given(source: str, said: str) -> None:
+    assert _pose_of(Provenance(source)) == said
 
 
 def test_the_text_of_single_things(run: Run, scene: str) -> None:

@@ -126,6 +126,27 @@ def test_a_datum_or_down_that_is_none_is_refused_by_name(tmp_path: Path, field: 
         read_dataset(tmp_path)
 
 
+def test_poses_of_an_old_server_are_exported_without_a_source(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.png").write_bytes(encode(".png", textured()))
+    image = PosedImage("a.png", CAMERA, truth().poses[0], provenance=Provenance("UNSPECIFIED"))
+    ((name, text),) = cameras_files([image], "test").items()
+    (tmp_path / name).write_text(text)
+    (frame,) = read_dataset(tmp_path).frames
+    assert frame.provenance == Provenance()
+
+
+def test_a_changed_accuracy_is_no_duplicate(
+    server: RunningServer, filled: tuple[str, list[NewReference]], tmp_path: Path
+) -> None:
+    assert run("export", filled[0], tmp_path / "out", "--address", server.address).exit_code == 0
+    described = tmp_path / "out" / "cameras.json"
+    described.write_text(described.read_text().replace('"rotation_95_deg": 0.4', '"rotation_95_deg": 0.5'))
+    done = run("import", tmp_path / "out", filled[0], "--skip-check", "--address", server.address)
+    assert "is there already, but its provenance differs" in done.output
+    assert "2 skipped as duplicates, 1 refused" in done.stdout
+
+
 def test_a_folder_with_something_in_it_is_not_written_to(
     server: RunningServer, filled: tuple[str, list[NewReference]], tmp_path: Path
 ) -> None:

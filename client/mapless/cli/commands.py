@@ -14,7 +14,7 @@ from ..geometry import Quaternion, RigidTransform
 from ..lenses import lens_model_of
 from ..names import check_id
 from ..pixels import format_of_image
-from ..provenance import PLACED
+from ..provenance import GIVEN, PLACED, Provenance
 from ..requests import NewReference
 from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
@@ -190,16 +190,16 @@ def _reference_card(it: Reference) -> list[str]:
         lens=None if lens is None else f"{lens} {' '.join(f'{k:g}' for k in vars(camera.distortion).values())}",
         position=" ".join(_position(it.world_from_camera)),
         rotation=f"x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}",
-        pose=_pose_of(it),
+        pose=_pose_of(it.provenance),
         features=it.feature_count,
         sha256=it.image_sha256,
         created=_minute(it),
     )
 
 
-def _pose_of(it: Reference) -> str:
-    accuracy = it.provenance.accuracy
-    source = "placed by mapless" if it.provenance.source == PLACED else "given"
+def _pose_of(provenance: Provenance) -> str:
+    accuracy = provenance.accuracy
+    source = {PLACED: "placed by mapless", GIVEN: "given"}.get(provenance.source, "unknown")
     return source if accuracy is None else f"{source}, within {accuracy.position_95_m:.3g} (95 %)"
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from mapless import AlreadyExists, Client, Reference
 from mapless.geometry import Camera, RigidTransform
+from mapless.provenance import GIVEN_POSE, UNKNOWN, Provenance
 from mapless_server.method.pairs.readings.repeats import pose_difference
 from mapless_server.scenes.repeats import SAME_POSITION_M, SAME_ROTATION_DEG
 from mapless_tools.dataset import Dataset, Frame
@@ -25,6 +26,7 @@ class Stored:
     world_from_camera: RigidTransform
     mask_sha256: str = ""
     depth_sha256: str = ""
+    provenance: Provenance = GIVEN_POSE
 
 
 Identity = Stored | Reference
@@ -68,7 +70,10 @@ _MASKED = {False: "it has no mask", True: "it has a mask"}
 
 
 def difference(there: Identity, new: Stored) -> str:
-    """Says in what two references differ besides their ids; empty if they are the same."""
+    """Says in what two references differ besides their ids; empty if they are the same.
+
+    Provenances differ only if both are known: most layouts say nothing of how poses are known, nor does an old server.
+    """
     if there.image_sha256 != new.image_sha256:
         return "its image differs"
     if there.mask_sha256 != new.mask_sha256:
@@ -76,8 +81,10 @@ def difference(there: Identity, new: Stored) -> str:
     if there.depth_sha256 != new.depth_sha256:
         is_both = there.depth_sha256 and new.depth_sha256
         return "its depth differs" if is_both else _WITH_DEPTH[bool(there.depth_sha256)]
-    return _camera_difference(there.camera, new.camera) or _pose_difference(
-        there.world_from_camera, new.world_from_camera
+    return (
+        _camera_difference(there.camera, new.camera)
+        or _pose_difference(there.world_from_camera, new.world_from_camera)
+        or _provenance_difference(there.provenance, new.provenance)
     )
 
 
@@ -98,6 +105,11 @@ def _pose_difference(there: RigidTransform, new: RigidTransform) -> str:
     if apart_m <= SAME_POSITION_M and turned_deg <= SAME_ROTATION_DEG:
         return ""
     return f"its pose is {apart_m:.6g} m and {turned_deg:.6g} degrees away"
+
+
+def _provenance_difference(there: Provenance, new: Provenance) -> str:
+    is_known = there.source != UNKNOWN and new != GIVEN_POSE
+    return "its provenance differs" if is_known and there != new else ""
 
 
 NO_METRES = "its unit of length is arbitrary: --scale, --distance or --align gives metres"

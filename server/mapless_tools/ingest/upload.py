@@ -186,7 +186,8 @@ def read_item(frame: Frame, limits: ImageLimits = ANY_SIZE) -> Item:
     depth = None if frame.depth is None else _read_depth(frame.depth, (width, height), limits)
     new = NewReference(frame.name, image, camera, frame.world_from_camera, mask, frame.provenance, depth)
     depth_sha256 = "" if depth is None else depth.sha256
-    return new, Stored(frame.name, digests[0], camera, frame.world_from_camera, digests[1], depth_sha256)
+    pose = frame.world_from_camera
+    return new, Stored(frame.name, digests[0], camera, pose, digests[1], depth_sha256, frame.provenance)
 
 
 def _read_depth(file: DepthFile, size: tuple[int, int], limits: ImageLimits) -> DepthImage:
