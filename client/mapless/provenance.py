@@ -75,7 +75,7 @@ def provenance_from_message(message: pb.Provenance, field: str) -> Provenance:
 
 
 def provenance_to_json(provenance: Provenance) -> dict[str, Any] | None:
-    """Provenance as JSON has it: `source` in small letters, and the radii; None for `GIVEN_POSE` or an unknown source."""
+    """Provenance as JSON: `source` in small letters, and the radii; None for `GIVEN_POSE` or an unknown source."""
     if provenance == GIVEN_POSE or provenance.source not in (GIVEN, PLACED):
         return None
     accuracy = provenance.accuracy

@@ -1,25 +1,40 @@
 """`mapless-server extend`: photographs are placed where they were taken, among references that stay as they are."""
 
+import errno
 import json
 import math
 import time
 from collections.abc import Iterator
+from datetime import datetime, timezone
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from support.commands import run
 from support.images import encode
 from support.servers import RunningServer
 from typer.testing import Result
 
-from mapless import Accuracy, Client, Provenance
+from mapless import Accuracy, Client, Provenance, Scene
 from mapless.geometry import RigidTransform, rotation_angle_deg
 from mapless_server.images import ANY_SIZE, decode_image
 from mapless_tools.demo.photographs import Photograph, room
-from mapless_tools.extend.accuracy import USUAL_POSITION, USUAL_ROTATION, Factors, _factors, accuracy_of
-from mapless_tools.extend.model import Estimate
+from mapless_tools.extend import session
+from mapless_tools.extend.accuracy import (
+    USUAL_POSITION,
+    USUAL_ROTATION,
+    Factors,
+    _factors,
+    accuracy_of,
+    measured_factors,
+)
+from mapless_tools.extend.model import Estimate, Fixed
+from mapless_tools.extend.placing import Placement
+from mapless_tools.extend.report import lines, went_well
+from mapless_tools.extend.run import ALREADY, Extension
+from mapless_tools.reconstruct.pictures import Omitted
 
 UNIT = 2.0
 """Of the scene, per metre: its unit is arbitrary."""
@@ -103,6 +118,16 @@ def test_a_dry_run_stores_nothing(server: RunningServer, client: Client, scene: 
     assert poses(client, scene) == before
 
 
+def test_a_full_disk_is_named(server: RunningServer, scene: str, photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    monkeypatch.setattr(session, "extend", full)
+    done = extended(server, scene, photos)
+    assert done.exit_code != 0
+    assert f"the disk of {photos.parent / 'work'} is full" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("count", "said"),
     [(0, "has no references: from fewer than 2"), (1, "has one reference: from fewer than 2"), (None, "no scene")],
@@ -136,3 +161,24 @@ def test_errors_of_placed_references_are_added() -> None:
     both = accuracy_of(estimate, Factors(2.0, 3.0, 9), {"given": 50, "placed": 50}, known)
     assert alone.position_68_m == pytest.approx(2 * 0.01 * 1.872, rel=0.01)
     assert both.position_68_m == pytest.approx(math.hypot(alone.position_68_m, 0.3 / math.sqrt(2)))
+    apart = accuracy_of(estimate, Factors(2.0, 3.0, 9), {"given": 0, "placed": 0}, known)
+    assert apart == both  # placed by other new photographs: as the references in the mean
+
+
+def test_no_reference_to_measure_by_leaves_the_usual_factors() -> None:
+    found = measured_factors(pycolmap.Reconstruction(), Fixed({}, frozenset()), [], False, 1, lambda *_: None)
+    assert (found.position, found.rotation, found.count) == pytest.approx((USUAL_POSITION, USUAL_ROTATION, 0))
+
+
+@pytest.mark.parametrize(
+    ("tried", "said", "is_well"),
+    [((), "nothing to place", True), ((Omitted("new", "it is blurred"),), "0 of 1 photographs are placed", False)],
+    ids=["all stored", "one refused"],
+)
+def test_only_tried_photographs_are_judged(tried: tuple[Omitted, ...], said: str, is_well: bool) -> None:
+    frames, there = Omitted("walk.mp4", "others are sharper", 900), Omitted("old", f"{ALREADY}, as reference old")
+    extension = Extension(
+        Scene("hall", 1, 3, datetime.now(timezone.utc)), {}, Placement((), tried), (frames, there, *tried), ()
+    )
+    assert list(lines(extension))[-1].startswith(said)
+    assert went_well(extension) == is_well

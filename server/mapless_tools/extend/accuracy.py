@@ -16,7 +16,7 @@ import pycolmap
 
 from mapless import Accuracy
 from mapless.geometry import RigidTransform, rotation_angle_deg
-from mapless.provenance import Provenance
+from mapless.provenance import RADII, Provenance
 from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_tools.progress import Progress, tracked
 
@@ -54,7 +54,7 @@ def measured_factors(
 
     Each reference has a camera of its own in the model; with `unknown_cameras`, they are estimated with the poses.
     """
-    names = names[:: 1 + (len(names) - 1) // MOST]
+    names = names[:: max(1, -(-len(names) // MOST))]
     groups = [names[i::FOLDS] for i in range(FOLDS)]
     groups = [it for it in groups if it and len(fixed.poses) - len(it) >= FEWEST_LEFT]
     cameras = {it.name: it.camera_id for it in posed_images(model)}
@@ -87,20 +87,18 @@ def accuracy_of(
 ) -> Accuracy:
     """Radii of a placed photograph that shares so many points with each reference.
 
-    Where these have an accuracy themselves, as those that were placed before, its mean square is added.
+    Where these have an accuracy themselves, as those that were placed before, its mean square is added: over the shared
+    points, or over all references if it shares none, as a photograph that was placed by other new ones.
     """
     scale = np.diag([factors.position] * 3 + [factors.rotation] * 3)
     own = accuracy_from_covariance(scale @ estimate.covariance @ scale)
-    total = sum(observed.values())
+    weights = observed if any(observed.values()) else dict.fromkeys(observed, 1)
+    total = sum(weights.values())
     squares = np.zeros(4)
-    for name, count in observed.items():
+    for name, weight in weights.items():
         known = provenances[name].accuracy
         if known is not None:
-            squares += count / total * np.square(_radii(known))
+            squares += weight / total * np.square([getattr(known, it) for it in RADII])
     radii = [math.hypot(radius, math.sqrt(square)) for radius, square in zip(vars(own).values(), squares, strict=True)]
     position_68_m, position_95_m, rotation_68_deg, rotation_95_deg = radii
     return Accuracy(position_68_m, position_95_m, rotation_68_deg, rotation_95_deg)
-
-
-def _radii(accuracy: Accuracy) -> list[float]:
-    return [accuracy.position_68_m, accuracy.position_95_m, accuracy.rotation_68_deg, accuracy.rotation_95_deg]

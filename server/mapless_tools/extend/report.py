@@ -31,8 +31,7 @@ def lines(extension: Extension) -> Iterator[str]:
             f"radii for {cameras} cameras are measured on {factors.count} references that were placed by the others: "
             f"errors are {factors.position:.1f} times what residuals say, {factors.rotation:.1f} times for rotations"
         )
-    tried = [it for it in extension.omitted if not is_there(it)]
-    total = len(extension.placement.placed) + sum(it.count for it in tried)
+    total = len(extension.placement.placed) + len(extension.placement.omitted)
     scene = extension.scene.scene_id
     if total:
         yield f"{len(extension.placement.placed)} of {total} photographs are placed in scene {scene}"
@@ -46,8 +45,10 @@ def is_there(omitted: Omitted) -> bool:
 
 
 def went_well(extension: Extension) -> bool:
-    """Whether at least one photograph is placed, or all are in the scene already."""
-    return bool(extension.placement.placed) or all(map(is_there, extension.omitted))
+    """Whether at least one photograph is placed, or none was tried because those chosen are in the scene already."""
+    if extension.placement.placed or extension.placement.omitted:
+        return bool(extension.placement.placed)
+    return any(map(is_there, extension.omitted))
 
 
 def to_json(extension: Extension, stored: ImportReport | None) -> dict[str, Any]:

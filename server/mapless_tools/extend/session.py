@@ -10,7 +10,7 @@ from mapless_server.settings import Settings
 from mapless_tools.connection import Connection, connected
 from mapless_tools.output_files import write_json
 from mapless_tools.progress import progress_bars
-from mapless_tools.reconstruct.folder import locked
+from mapless_tools.reconstruct.folder import full_disk_named, locked
 from mapless_tools.reconstruct.run import prepare
 from mapless_tools.reconstruct.sources import SourceOptions, read_sources
 
@@ -40,7 +40,7 @@ def extend_scene(
         if not is_dry:  # a call that needs the same role as storing, and changes nothing
             next(iter(client.audit_scene(scene, [references[0].reference_id])))
         work = prepare(photos, out)
-        with locked(work, out):
+        with locked(work, out), full_disk_named(out):
             pictures = read_sources(photos, work / "pictures", sources, progress)
             extension, known = extend(client, scene, pictures, work, options, progress)
             stored = None

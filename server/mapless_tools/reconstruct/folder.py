@@ -25,7 +25,7 @@ def reconstruct_into(sources: Sequence[Path], out: Path, wanted: SourceOptions, 
     check_files(options.world)
     with terminable(), progress_bars() as progress:
         work = prepare(sources, out)
-        with locked(work, out), _full_disk_named(out):
+        with locked(work, out), full_disk_named(out):
             pictures = read_sources(sources, work / "pictures", wanted, progress)
             check_names(options.world, pictures)
             result = reconstruct(pictures, work, options, progress)
@@ -54,7 +54,7 @@ def locked(work: Path, out: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _full_disk_named(out: Path) -> Iterator[None]:
+def full_disk_named(out: Path) -> Iterator[None]:
     """Raises OSError with a sentence where a disk is full; SQLite within pycolmap says it in other words."""
     try:
         yield

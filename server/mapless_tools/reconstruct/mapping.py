@@ -63,8 +63,11 @@ def map_photographs(
     found = sorted(folder.iterdir())
     for place in tracked("refinement", found, len(found), progress):
         model = pycolmap.Reconstruction(str(place))
-        for number in set(known) & set(model.cameras):
+        restored = set(known) & set(model.cameras)
+        for number in restored:
             model.cameras[number].params = given[number].params.tolist()  # the global mapper refines all
+        if restored:
+            model.write(str(place))
         if model.num_reg_images() >= FEWEST and refine(model, known, threads):
             model.write(str(place))
 

@@ -44,7 +44,7 @@ def refine(model: pycolmap.Reconstruction, known: Collection[int], threads: int)
     adjuster = _adjust(model, known, threads, focal_alone=False)
     model.update_point_3d_errors()
     options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.ALL)
-    found = pycolmap.estimate_ba_covariance(options, model, adjuster)
+    found = interruptible(lambda: pycolmap.estimate_ba_covariance(options, model, adjuster))
     if found is None:
         return False
     for camera in cameras:

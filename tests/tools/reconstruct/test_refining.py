@@ -1,5 +1,6 @@
 """The last adjustment of a reconstruction, on synthetic photographs with a planted lens."""
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pycolmap
 import pytest
 
 from mapless.geometry import Array
+from mapless_tools.reconstruct import mapping
 from mapless_tools.reconstruct.refining import refine
 
 TRUE = np.array([900.0, 522.0, 376.0, 0.05, -0.02])
@@ -74,3 +76,32 @@ def test_three_photographs_leave_the_lens_plausible(model: pycolmap.Reconstructi
     _, x, y, *coefficients = _parameters(three)
     assert np.hypot(x - TRUE[1], y - TRUE[2]) < 20
     assert np.abs(coefficients).max() < 0.3
+
+
+def test_covariances_are_computed_where_an_interrupt_ends_them(
+    model: pycolmap.Reconstruction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads = []
+    monkeypatch.setattr(pycolmap, "estimate_ba_covariance", lambda *_: threads.append(threading.current_thread()))
+    assert not refine(model, [], 1)
+    assert threading.main_thread() not in threads
+
+
+def test_known_camera_is_kept_in_a_model_that_is_not_refined(
+    model: pycolmap.Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database, camera = tmp_path / "database.db", _camera(model)
+    given = _parameters(model).copy()
+    with pycolmap.Database.open(database) as content:
+        content.write_camera(camera, use_camera_id=True)
+
+    def mapped(_: Path, folder: Path, *rest: object) -> None:
+        camera.params = (given + 1).tolist()  # the global mapper refines all
+        (folder / "0").mkdir()
+        model.write(str(folder / "0"))
+
+    monkeypatch.setattr(mapping, "map_incrementally", mapped)
+    monkeypatch.setattr(mapping, "refine", lambda *_: False)
+    mapping.map_photographs(database, tmp_path / "models", 8, [camera.camera_id], 1, lambda *_: None)
+    written = pycolmap.Reconstruction(str(tmp_path / "models" / "0"))
+    assert _parameters(written) == pytest.approx(given)
