@@ -127,8 +127,9 @@ def why_no_part(database: Path, folder: Path) -> str:
         )
     if any(folder.iterdir()) or _without_parallax(verified):
         return (
-            "the camera seems only to have turned: photographs differ as those from one place do, so that nothing "
-            "shows how far it moved, or all show one flat surface; move the camera by a step between photographs"
+            "the camera seems only to have turned, or stood still while something moved: photographs differ as those "
+            "from one place do, so that nothing shows how far it moved, or all show one flat surface; move the camera "
+            "by a step between photographs"
         )
     return (
         "too few photographs fit together for poses: at least three must show the same place from different positions"

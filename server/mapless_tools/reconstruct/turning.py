@@ -20,7 +20,7 @@ TURN_SHARE = 0.002
 PARALLAX_SHARE = 0.25
 """Least share of pairs whose matches are farther off. Evidence: parallax."""
 _MATCHES, _PAIRS = 100, 150
-_MIN_MATCHES = 15
+_MIN_MATCHES, _ROUNDS = 15, 10
 _FACTORS, _RADIAL = (0.4, 0.55, 0.75, 1.0, 1.35, 1.8, 2.5), 0.5
 """Focal lengths at which the search begins, and the largest radial coefficient."""
 
@@ -79,16 +79,20 @@ def _pairs(database: Path, image_ids: Collection[int]) -> Array:
 
 
 def _off_turn(pairs: Array, factor: float, radial: float) -> Array:
-    """Median distance (P,) of each pair's matches from where the best turn moves them, over the longer side."""
+    """Median distance (P,) of each pair's matches from where the best turn moves them, over the longer side.
+
+    The turn minimizes the sum of the distances' logarithms, not of their squares: it is that of most matches, also
+    where others are of an object that moves before a camera that stands still.
+    """
     plane = pairs[..., :2] / factor
     plane = plane * (1 + radial * (plane**2).sum(axis=-1, keepdims=True))
     rays = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     weights = np.ones(rays.shape[::2][:1] + rays.shape[2:3])
-    for _ in range(2):
+    for _ in range(_ROUNDS):
         u, _, vt = np.linalg.svd(np.einsum("pm,pmi,pmj->pij", weights, rays[:, 1], rays[:, 0]))
         u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
         turned = rays[:, 0] @ np.swapaxes(u @ vt, 1, 2)
         off = np.linalg.norm(turned - rays[:, 1], axis=-1) * factor * pairs[:, 1, :, 2]
-        weights = (off <= 3 * np.median(off, axis=1, keepdims=True)).astype(float)
+        weights = 1 / np.maximum(off, TURN_SHARE) ** 2
     return np.asarray(np.median(off, axis=1))
