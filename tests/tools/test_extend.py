@@ -31,7 +31,8 @@ from mapless_tools.extend.accuracy import (
     measured_factors,
 )
 from mapless_tools.extend.model import Estimate, Fixed
-from mapless_tools.extend.placing import Placement
+from mapless_tools.extend.options import ExtendOptions
+from mapless_tools.extend.placing import Placement, _uncertainty
 from mapless_tools.extend.report import lines, went_well
 from mapless_tools.extend.run import ALREADY, Extension
 from mapless_tools.reconstruct.pictures import Omitted
@@ -163,6 +164,23 @@ def test_errors_of_placed_references_are_added() -> None:
     assert both.position_68_m == pytest.approx(math.hypot(alone.position_68_m, 0.3 / math.sqrt(2)))
     apart = accuracy_of(estimate, Factors(2.0, 3.0, 9), {"given": 0, "placed": 0}, known)
     assert apart == both  # placed by other new photographs: as the references in the mean
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "said"),
+    [
+        (Accuracy(500, 900, 1, 2), ""),
+        (Accuracy(500, 1001, 1, 2), "above 1000 units"),
+        (Accuracy(1, 2, 90, 181), "or 180 degrees"),
+        (Accuracy(5e5, 9e5, 1, 2), "900 % of the distance"),
+    ],
+    ids=["good", "far", "turned", "against its depth"],
+)
+def test_what_a_reference_may_not_have_is_not_placed(accuracy: Accuracy, said: str) -> None:
+    """In a scene whose unit is the millimetre, photographs of what is 100 m away."""
+    reason = _uncertainty(accuracy, 1e5, ExtendOptions())
+    assert said in reason
+    assert bool(said) == bool(reason)
 
 
 def test_no_reference_to_measure_by_leaves_the_usual_factors() -> None:

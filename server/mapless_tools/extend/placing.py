@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapless import Accuracy
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless.provenance import Provenance
+from mapless.provenance import LARGEST_DEG, LARGEST_M, Provenance
 from mapless_tools.progress import Progress
 from mapless_tools.reconstruct.cameras import from_colmap
 from mapless_tools.reconstruct.mapping import FEWEST_MATCHES, matches_reason
@@ -86,9 +86,8 @@ def place(
             continue
         shared = references_seen(model, image, [*fixed.poses])
         accuracy = accuracy_of(estimate, factors[image.camera_id in unknown], shared, provenances)
-        share = accuracy.position_95_m / float(np.median(depths_of(model, image)))
-        if not share <= options.largest_radius:
-            refused[image.name] = _UNCERTAIN.format(share=100 * share)
+        if reason := _uncertainty(accuracy, float(np.median(depths_of(model, image))), options):
+            refused[image.name] = reason
             continue
         camera = from_colmap(model.cameras[image.camera_id])
         placed.append(Placed(image.name, camera, estimate.world_from_camera, accuracy, image.num_points3D))
@@ -96,7 +95,17 @@ def place(
 
 
 _UNDETERMINED = "its matches do not determine a pose"
-_UNCERTAIN = "its position is known to {share:.0f} % of the distance to what it shows only: too little for a reference"
+
+
+def _uncertainty(accuracy: Accuracy, depth: float, options: ExtendOptions) -> str:
+    """Why a pose is not known well enough for a reference, at the depth of what it shows; empty if it is."""
+    share = accuracy.position_95_m / depth
+    if not share <= options.largest_radius:
+        known = f"its position is known to {100 * share:.0f} % of the distance to what it shows only"
+        return f"{known}: too little for a reference"
+    if accuracy.position_95_m > LARGEST_M or accuracy.rotation_95_deg > LARGEST_DEG:
+        return f"its radii are above {LARGEST_M:g} units or {LARGEST_DEG:g} degrees, the most that a reference may have"
+    return ""
 
 
 def _verified_pairs(database: Path) -> dict[str, dict[str, int]]:
