@@ -30,7 +30,7 @@ from .answers import (
 )
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
-from .depth import DepthImage, DepthNoise, DepthSensor
+from .depth import DepthImage, DepthNoise, DepthSensor, IgnoredDepth
 from .diagnostics import Attempt, Debug, Diagnostics, LadderCut, ReferenceUse, ScaleEstimate
 from .errors import (
     AlreadyExists,
@@ -95,6 +95,7 @@ __all__ = [
     "HeadingPrior",
     "Hint",
     "Hypothesis",
+    "IgnoredDepth",
     "IgnoredMask",
     "ImageReport",
     "Internal",

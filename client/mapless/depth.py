@@ -141,6 +141,15 @@ class DepthImage:
         return digest.hexdigest()
 
 
+class IgnoredDepth(UserWarning):
+    """A server that is older than depth has stored a reference without it."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the server has ignored the depth of references: it is older than depth, which 0.3 does not know"
+        )
+
+
 def _numbers_of(camera: Camera) -> dict[str, object]:
     """The numbers of a camera by fixed names, which checksums that are stored contain."""
     lens = camera.distortion

@@ -49,13 +49,11 @@ class DepthFile:
     size: tuple[int, int] | None = None
 
     def scaled(self, scale: float) -> DepthFile:
-        """The same depth in a unit of length of which there are `scale` in the present one."""
-        pose, noise = self.camera_from_depth_camera, self.noise
+        """The same depth in a unit of length of which there are `scale` in the present one; noise stays in metres."""
+        pose = self.camera_from_depth_camera
         if pose is not None:
             pose = RigidTransform(pose.rotation, scale * pose.translation)
-        if noise is not None:
-            noise = replace(noise, constant_m=scale * noise.constant_m, quadratic_per_m=noise.quadratic_per_m / scale)
-        return replace(self, unit_m=scale * self.unit_m, camera_from_depth_camera=pose, noise=noise)
+        return replace(self, unit_m=scale * self.unit_m, camera_from_depth_camera=pose)
 
     def read(self) -> DepthImage:
         """Reads the files; OSError."""

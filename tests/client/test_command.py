@@ -255,6 +255,16 @@ def test_a_file_whose_name_is_no_id_needs_one(run: Run, scene: str, tmp_path: Pa
     assert (code, stored["reference_id"]) == (0, "mine")
 
 
+@pytest.mark.parametrize("option", [("unit", "0.01"), ("sensor", "stereo"), ("camera", "c.json"), ("pose", "p.json")])
+def test_options_of_a_depth_need_one(
+    run: Run, scene: str, tmp_path: Path, camera_json: str, option: tuple[str, str]
+) -> None:
+    (tmp_path / "view.png").write_bytes(PHOTO)
+    where = ("--camera", camera_json, "--pose", json.dumps(plain(pose(0.5))))
+    code, _, error = run("reference", "add", scene, tmp_path / "view.png", *where, f"--depth-{option[0]}", option[1])
+    assert (code, f"--depth-{option[0]} " in error, "--depth, too" in error) == (2, True, True)
+
+
 def test_a_blank_reference_is_warned_of(run: Run, scene: str, tmp_path: Path, camera_json: str) -> None:
     (tmp_path / "blank.png").write_bytes(BLACK)
     where = ("--camera", camera_json, "--pose", json.dumps(plain(pose(0.5))))

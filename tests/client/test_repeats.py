@@ -16,6 +16,7 @@ from support.clients import Played
 from mapless import wire
 from mapless.calls import localization, references, repeats
 from mapless.connection import Connection
+from mapless.depth import DepthImage, IgnoredDepth
 from mapless.errors import AlreadyExists, Internal, NotFound, Unavailable
 from mapless.geodesy import Datum
 from mapless.geometry import Camera, Quaternion, RigidTransform
@@ -128,6 +129,22 @@ def test_only_what_the_scene_lacks_is_sent_again() -> None:
     _, request = played.calls[-1]
     assert isinstance(request, pb.BatchCreateReferencesRequest)
     assert list(request.requests) == lacked
+
+
+@pytest.mark.parametrize("is_old", [True, False])
+def test_depth_counts_only_where_servers_know_it(is_old: bool) -> None:
+    pose = RigidTransform(np.eye(3), np.zeros(3))
+    wanted = create_request("scenes/a", NewReference("r", b"1", CAMERA, pose, depth=DepthImage(b"depth", 0.001)))
+    there = stored(wanted)
+    there.ClearField("depth")
+    if is_old:
+        there.ClearField("provenance")
+        with pytest.warns(IgnoredDepth):
+            found = added([wanted], [TAKEN, pb.ListReferencesResponse(references=[there])]).result
+        assert [it.reference_id for it in found] == ["r"]
+    else:
+        error = added([wanted], [TAKEN, pb.ListReferencesResponse(references=[there])]).result
+        assert error.message == "reference 'r' exists already, with another depth"
 
 
 @pytest.mark.parametrize("what", ["photograph", "mask", "intrinsics", "pose"])

@@ -67,9 +67,18 @@ def test_depths_of_transforms_are_scaled_with_the_poses(tmp_path: Path) -> None:
     scaled = in_metres(dataset, MetreOptions(scale=0.5)).frames[0].depth
     assert scaled is not None
     assert scaled.unit_m == 0.0005
-    edit(folder / "transforms.json", lambda it: it["frames"][0].update(depth_file_path="none.png"))
-    (reason,) = reasons(read_dataset(folder)).values()
-    assert reason.startswith("depth_file_path:")
+
+
+@pytest.mark.parametrize("path", ["none.png", "depth.npy", "colours.png", 5])
+def test_photographs_whose_depth_is_unusable_are_kept(tmp_path: Path, path: object) -> None:
+    folder = write_transforms(tmp_path)
+    count = len(read_dataset(folder).frames)
+    (folder / "depth.npy").write_bytes(b"\x93NUMPY")
+    (folder / "colours.png").write_bytes(encode(".png", np.ones((64, 96, 3), np.uint8)))
+    edit(folder / "transforms.json", lambda it: it["frames"][0].update(depth_file_path=path))
+    dataset = read_dataset(folder)
+    assert (len(dataset.frames), dataset.refused, dataset.frames[0].depth) == (count, (), None)
+    assert any(it.startswith(f"1 depths are left out; the first, {path}: ") for it in dataset.notes)
 
 
 def test_an_applied_transform_and_scale_are_undone(tmp_path: Path) -> None:
@@ -260,6 +269,15 @@ def test_tum_photographs_have_the_depth_nearest_in_time(tmp_path: Path) -> None:
     assert names == [f"{times[0] + 0.004:.6f}.png", f"{times[1] + 0.01:.6f}.png", None]
     assert depths[0] is not None
     assert (depths[0].unit_m, depths[0].sensor) == (0.0002, DepthSensor.STRUCTURED_LIGHT)
+
+
+@pytest.mark.parametrize("line", ["{time:.6f} depth/1.png", "{time:.6f}", "noon depth/1.png"])
+def test_tum_without_the_depth_it_lists_is_read(tmp_path: Path, line: str) -> None:
+    folder, times = write_tum(tmp_path / "rgbd_dataset_freiburg3_office")
+    (folder / "depth.txt").write_text(line.format(time=times[0]) + "\n")
+    dataset = read_dataset(folder)
+    assert (len(dataset.frames), dataset.refused, dataset.frames[0].depth) == (len(times), (), None)
+    assert "1 depths are left out" in dataset.notes[-1]
 
 
 def test_tum_frames_without_ground_truth_nearby_are_refused(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Scenes and references: create, get, update, list, delete; retrieval, audit and coverage."""
 
 import re
+import warnings
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from .. import wire
 from ..connection import Connection
+from ..depth import IgnoredDepth
 from ..errors import AlreadyExists, MaplessError
 from ..geodesy import Datum
 from ..geometry import Camera, RigidTransform
@@ -127,7 +129,16 @@ async def add_reference(
     """Stores a reference."""
     request = await connection.unblocked(create_request, scene_name(scene), reference)
     on_repeat = partial(repeats.stored_reference, request)
-    return await connection.call("CreateReference", request, _reference, timeout_s, on_repeat=on_repeat)
+    stored = await connection.call("CreateReference", request, _reference, timeout_s, on_repeat=on_repeat)
+    _check_depths([request], [stored])
+    return stored
+
+
+def _check_depths(requests: Iterable[pb.CreateReferenceRequest], stored: Iterable[Reference]) -> None:
+    """Warns if a server has ignored depth because it is too old to know it."""
+    both = zip(requests, stored, strict=True)
+    if any(it.reference.HasField("depth") and not found.depth_sha256 for it, found in both):
+        warnings.warn(IgnoredDepth(), stacklevel=2)
 
 
 def _reference(response: Any) -> Reference:
@@ -199,7 +210,9 @@ async def add_batch(
     except MaplessError as error:
         _name_reference(error, new)
         raise
-    return [there[name] for name in names]
+    stored = [there[name] for name in names]
+    _check_depths(requests, stored)
+    return stored
 
 
 def _by_name(response: pb.BatchCreateReferencesResponse) -> dict[str, Reference]:

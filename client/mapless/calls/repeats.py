@@ -64,14 +64,16 @@ def difference(wanted: pb.Reference, stored: Reference) -> str:
         return "photograph"
     if stored.mask_sha256 != (hashlib.sha256(wanted.mask).hexdigest() if wanted.HasField("mask") else ""):
         return "mask"
-    if stored.depth_sha256 != (depth_from_message(wanted.depth, "depth").sha256 if wanted.HasField("depth") else ""):
+    is_kept = stored.provenance.source != UNKNOWN  # by servers that know depth, too
+    if is_kept and stored.depth_sha256 != (
+        depth_from_message(wanted.depth, "depth").sha256 if wanted.HasField("depth") else ""
+    ):
         return "depth"
     if wire.camera_to_message(stored.camera) != wanted.intrinsics:
         return "intrinsics"
     ours = wire.transform_from_message(wanted.world_from_camera, "").matrix()
     if not np.allclose(ours, stored.world_from_camera.matrix(), rtol=0, atol=_SAME):
         return "pose"
-    is_kept = stored.provenance.source != UNKNOWN
     return "provenance" if is_kept and provenance_from_message(wanted.provenance, "") != stored.provenance else ""
 
 

@@ -299,13 +299,10 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     add.add_argument(
         "--depth", type=Path, metavar="FILE", help="its depth: a PNG of 16 bits, of the same camera or --depth-camera"
     )
-    add.add_argument(
-        "--depth-unit", type=float, default=0.001, metavar="M", help="metres of 1 in it (default: 0.001, millimetres)"
-    )
+    add.add_argument("--depth-unit", type=float, metavar="M", help="metres of 1 in it (default: 0.001, millimetres)")
     add.add_argument(
         "--depth-sensor",
         choices=[it.value for it in DepthSensor],
-        default=DepthSensor.UNKNOWN.value,
         help="the kind of sensor, by which its errors are known (default: unknown)",
     )
     add.add_argument("--depth-camera", metavar="CAMERA", help="the camera of the depth, if it is another, as --camera")

@@ -140,11 +140,14 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
 def _depth(arguments: argparse.Namespace) -> DepthImage | None:
     """The depth that was measured with a photograph; None without one."""
     if arguments.depth is None:
+        for name in ("unit", "sensor", "camera", "pose"):
+            if getattr(arguments, f"depth_{name}") is not None:
+                raise ValueError(f"--depth-{name} says something of a depth: give --depth, too")
         return None
     return DepthImage(
         arguments.depth.read_bytes(),
-        arguments.depth_unit,
-        sensor=DepthSensor(arguments.depth_sensor),
+        0.001 if arguments.depth_unit is None else arguments.depth_unit,
+        sensor=DepthSensor(arguments.depth_sensor or DepthSensor.UNKNOWN),
         camera=None if arguments.depth_camera is None else read_camera(arguments.depth_camera, arguments.depth),
         camera_from_depth_camera=None if arguments.depth_pose is None else read_pose(arguments.depth_pose),
     )

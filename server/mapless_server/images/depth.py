@@ -34,8 +34,10 @@ def check_depth(depth: DepthImage, photo: tuple[int, int], limits: ImageLimits, 
     path = f"{field}.png" if depth.size is None else f"{field}.float32"
     size = depth.size or _checked_png(depth.data, 16, limits, path)
     if size[0] * size[1] > limits.max_depth_pixels:
-        message = f"the depth is {size[0]}x{size[1]} pixels, at most {limits.max_depth_pixels} in all are accepted"
-        raise InvalidArgument(f"{message}: reduce it", reason="DEPTH_TOO_LARGE", field=path)
+        message = (
+            f"the depth is {size[0]}x{size[1]} pixels, at most {limits.max_depth_pixels} in all are accepted: reduce it"
+        )
+        raise InvalidArgument(message, reason="DEPTH_TOO_LARGE", field=path)
     if len(depth.data) > limits.max_bytes:
         message = f"the depth has {len(depth.data)} bytes, at most {limits.max_bytes} are accepted"
         raise InvalidArgument(message, reason="DEPTH_TOO_LARGE", field=path)

@@ -358,16 +358,21 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         warnings += await self._stored(self._said_of, scene_key, agreements.known(scene_key))
         shares = {it.reference_id: found.ignored_share for it, found in zip(records, described, strict=True)}
         depths = {it.reference_id: found.median_depth for it, found in zip(records, described, strict=True)}
-        return records, [*warnings, *nearly_ignored(shares), *implausible_depths(depths)]
+        implausible = implausible_depths(depths)
+        if implausible and not await self._stored(self._is_arbitrary, scene_key):
+            warnings += implausible
+        return records, [*warnings, *nearly_ignored(shares)]
 
     def _said_of(self, scene_key: SceneKey, agreement: Agreement) -> list[str]:
         """Returns what is said of a scene's agreement; nothing of a unit that cannot be read."""
-        if not agreement.warnings(arbitrary_unit=False):
-            return []
+        return agreement.warnings(arbitrary_unit=False) and agreement.warnings(self._is_arbitrary(scene_key))
+
+    def _is_arbitrary(self, scene_key: SceneKey) -> bool:
+        """Whether a scene's unit is arbitrary; one that cannot be read may be."""
         try:
-            return agreement.warnings(self._store.get_attributes(scene_key).arbitrary_unit)
+            return self._store.get_attributes(scene_key).arbitrary_unit
         except (DataLoss, NotFound):
-            return agreement.warnings(arbitrary_unit=True)
+            return True
 
     def _repeats(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> list[str]:
         """Returns and logs which poses or photographs the references to be added repeat."""

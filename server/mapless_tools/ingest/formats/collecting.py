@@ -13,13 +13,14 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from mapless.cameras import MAX_SIDE_PX
+from mapless.depth import DepthSensor
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
 from mapless.provenance import GIVEN_POSE, Provenance
 from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ANY_SIZE, image_size
+from mapless_server.images import ANY_SIZE, ImageLimits, check_depth, image_size
 from mapless_tools.bags.options import BagOptions
-from mapless_tools.dataset import Dataset, DepthFile, Frame, Refusal, image_file, legal_id, named
+from mapless_tools.dataset import Dataset, DepthFile, Frame, Refusal, image_file, legal_id, named, path_in, printable
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ class Collector:
         self.frames: list[Frame] = []
         self.refused: list[Refusal] = []
         self.notes: list[str] = []
+        self._unused_depths: list[str] = []
         self._ids: set[str] = set()
         self._images: set[Path] = set()
 
@@ -105,6 +107,10 @@ class Collector:
             yield
         except ValueError as error:
             self.refused.append(Refusal(frame, str(error)))
+
+    def leave_out_depth(self, depth: str, error: Exception) -> None:
+        """Notes that a depth cannot be used."""
+        self._unused_depths.append(f"{depth}: {str(error).removeprefix('image: ')}")
 
     def image(self, image: str) -> Path:
         """The file of an image; ValueError as in `image_file`, or if an earlier frame has the same file."""
@@ -141,6 +147,18 @@ class Collector:
         self._ids.add(identifier)
         self._images.add(file)
 
+    def depth(
+        self, path: object, photo: tuple[int, int], unit_m: float, sensor: DepthSensor = DepthSensor.UNKNOWN
+    ) -> DepthFile | None:
+        """The depth of a frame of this size, (width, height) pixels; None, and a note, if it cannot be used."""
+        try:
+            depth = DepthFile(path_in(self.folder, path), unit_m, sensor)
+            check_depth(depth.read(), photo, ImageLimits())
+        except (InvalidArgument, OSError, ValueError) as error:
+            self.leave_out_depth(str(path), error)
+            return None
+        return depth
+
     def _mask(self, mask: str | None) -> Path | None:
         if mask is None:
             return None
@@ -156,8 +174,13 @@ class Collector:
         if not self.frames:
             first = f"; the first, {self.refused[0].frame}: {self.refused[0].reason}" if self.refused else ""
             raise ValueError(f"{self.folder}: none of {len(self.refused)} frames can be used{first}")
+        notes = list(self.notes)
+        if self._unused_depths:
+            notes.append(
+                printable(f"{len(self._unused_depths)} depths are left out; the first, {self._unused_depths[0]}")
+            )
         return Dataset(
-            name, tuple(self.frames), metric, source, ground_truth, layout, tuple(self.refused), tuple(self.notes)
+            name, tuple(self.frames), metric, source, ground_truth, layout, tuple(self.refused), tuple(notes)
         )
 
 

@@ -5,7 +5,8 @@ OpenGL's camera axes); in a frame or for all, `fl_x`, `fl_y`, `cx`, `cy`, `w`, `
 `camera_model`, `is_fisheye`, k1 to k4, p1 and p2; and for all `applied_transform` and `applied_scale`, which are
 undone, and `train_filenames`, `val_filenames`, `test_filenames`. A frame's `mask_path` is its mask: black pixels are
 ignored, as in nerfstudio. A frame's `depth_file_path` is its depth, of the same camera: a PNG of 16 bits in thousandths
-of the unit of the poses before `applied_scale`, nerfstudio's `depth_unit_scale_factor`.
+of the unit of the poses before `applied_scale`, nerfstudio's `depth_unit_scale_factor`. Other depth, such as .npy, is
+left out with a note.
 
 Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so principal points count from the corner.
 """
@@ -17,7 +18,7 @@ from typing import Any
 
 from mapless.geometry import Camera, RigidTransform, nearest_rotation
 from mapless.lenses import Distortion, Fisheye, RadialTangential
-from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named, path_in, read_json
+from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named, read_json
 
 from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of
 
@@ -64,7 +65,7 @@ def _read_file(file: Path, split: str, collector: Collector) -> None:
             pose = _world_from_camera(frame, scale, transform)
             camera = _camera(collector, image, content | frame)
             its_split = splits.get(str(frame["file_path"]), split)
-            depth = _depth(collector.folder, frame)
+            depth = _depth(collector, frame, camera)
             collector.add(image, camera, pose, its_split, mask=frame.get("mask_path"), depth=depth)
 
 
@@ -75,11 +76,9 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
     return collector.image(str(PurePosixPath(path))).relative_to(collector.folder).as_posix()
 
 
-def _depth(folder: Path, frame: Mapping[str, Any]) -> DepthFile | None:
-    if frame.get("depth_file_path") is None:
-        return None
-    with named("depth_file_path"):
-        return DepthFile(path_in(folder, frame["depth_file_path"]), DEPTH_UNIT)
+def _depth(collector: Collector, frame: Mapping[str, Any], camera: Camera) -> DepthFile | None:
+    path = frame.get("depth_file_path")
+    return None if path is None else collector.depth(path, (camera.width_px, camera.height_px), DEPTH_UNIT)
 
 
 def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:

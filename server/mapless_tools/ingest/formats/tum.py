@@ -4,7 +4,7 @@ Lines of rgb.txt are a time in seconds and an image's path; of groundtruth.txt a
 world_from_camera, from motion capture at 100 Hz. A frame's pose is interpolated between the two before and after it.
 
 Lines of depth.txt, if there is one, are as of rgb.txt: PNGs of 16 bits, 5000 per metre, registered to the photographs.
-A photograph's depth is the nearest in time.
+A photograph's depth is the nearest in time; one that cannot be used is left out with a note.
 
 The layout has no intrinsics: they are those published for the camera of freiburg1, 2 or 3, by the folder's
 name, or given. Images of freiburg3 are undistorted already.
@@ -19,7 +19,7 @@ from mapless.depth import DepthSensor
 from mapless.geometry import Array, Camera
 from mapless.lenses import RadialTangential
 from mapless_tools.bags.trajectory import Trajectory
-from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named, path_in
+from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named
 
 from .collecting import Collector, ReadOptions, filled_lines, size_of
 
@@ -51,7 +51,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         trajectory = Trajectory(rows, MAX_GAP_S)
     except ValueError as error:
         raise ValueError(f"{file} {error}") from error
-    depths = _Depths(path)
+    depths = _Depths(collector)
     for number, words in _lines(path / "rgb.txt"):
         with collector.attempt(f"rgb.txt:{number} ({words[-1]})"):
             if len(words) != 2:
@@ -65,36 +65,38 @@ def read(path: Path, options: ReadOptions) -> Dataset:
                 camera = lens
             else:
                 raise ValueError(f"image: is {size[0]}x{size[1]}, the known intrinsics are of 640x480")
-            collector.add(words[1], camera, trajectory.at(time_s), name=file.stem, depth=depths.at(time_s))
+            collector.add(words[1], camera, trajectory.at(time_s), name=file.stem, depth=depths.at(time_s, size))
     return collector.dataset(path.resolve().name, "tum", metric=True, source="TUM RGB-D", ground_truth="motion capture")
 
 
 class _Depths:
     """Depths of a sequence by their times; none without a depth.txt."""
 
-    def __init__(self, folder: Path) -> None:
-        file = folder / "depth.txt"
-        self._folder = folder
+    def __init__(self, collector: Collector) -> None:
+        file = collector.folder / "depth.txt"
+        self._collector = collector
+        self._times_s: list[float] = []
         self._paths: list[str] = []
-        times: list[float] = []
         for number, words in _lines(file) if file.is_file() else []:
-            with named(f"{file}:{number}"):
-                if len(words) != 2:
-                    raise ValueError(f"expected a time and a path, found {len(words)} words")
-                times.append(float(finite_numbers(words[0], "time")))
-                self._paths.append(words[1])
-        self._times_s = np.array(times)
+            self._add(f"{file.name}:{number}", words)
 
-    def at(self, time_s: float) -> DepthFile | None:
-        """The depth nearest to a time; None if none is within `MAX_GAP_S`. ValueError if it has no file."""
+    def _add(self, line: str, words: list[str]) -> None:
+        try:
+            if len(words) != 2:
+                raise ValueError(f"expected a time and a path, found {len(words)} words")
+            self._times_s.append(float(finite_numbers(words[0], "time")))
+            self._paths.append(words[1])
+        except ValueError as error:
+            self._collector.leave_out_depth(line, error)
+
+    def at(self, time_s: float, photo: tuple[int, int]) -> DepthFile | None:
+        """The depth nearest to a time, of a photograph of this size; None if none within `MAX_GAP_S` can be used."""
         if not self._paths:
             return None
-        nearest = int(np.argmin(np.abs(self._times_s - time_s)))
+        nearest = int(np.argmin(np.abs(np.array(self._times_s) - time_s)))
         if abs(self._times_s[nearest] - time_s) > MAX_GAP_S:
             return None
-        with named("depth"):
-            path = path_in(self._folder, self._paths[nearest])
-        return DepthFile(path, DEPTH_UNIT_M, DepthSensor.STRUCTURED_LIGHT)
+        return self._collector.depth(self._paths[nearest], photo, DEPTH_UNIT_M, DepthSensor.STRUCTURED_LIGHT)
 
 
 def _lens(path: Path) -> Camera:
