@@ -22,6 +22,8 @@ FISHEYE = "fisheye"
 """The lens for which `LensOptions` wants no file: its coefficients are estimated."""
 GUESSED_FOCAL = 1.2
 """Focal length over the longer side where nothing is known of it, COLMAP's: 45 degrees of view."""
+GUESSED_FISHEYE_FOCAL = 0.5
+"""The same of fisheyes: 115 degrees across."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,10 @@ class StartingCamera:
     is_known: bool = False
 
     def to_colmap(self, camera_id: int) -> pycolmap.Camera:
-        """The camera in the model in which it is refined: one radial coefficient, more for a fisheye."""
+        """The camera in the model in which it is refined: one radial coefficient, more for a fisheye.
+
+        Pairs of fisheyes are verified by their rays, which need a focal length: the guess counts as one.
+        """
         it = from_camera(camera_id, self.camera)
         model, parameters = it.model, list(it.parameters)
         if not self.is_known:
@@ -79,7 +84,7 @@ class StartingCamera:
             width=it.width_px,
             height=it.height_px,
             params=parameters,
-            has_prior_focal_length=self.has_focal,
+            has_prior_focal_length=self.has_focal or model == "RADIAL_FISHEYE",
         )
 
 
@@ -136,7 +141,8 @@ def _starting_camera(pictures: Sequence[Picture], options: LensOptions) -> Start
         by_exif, refusal = focal_of(picture.exif, width, height), ""
     except ValueError as error:
         by_exif, refusal = None, f"; EXIF is not used: {error}"
-    focal_px = GUESSED_FOCAL * max(width, height) if by_exif is None else by_exif.focal_px
+    guess = GUESSED_FISHEYE_FOCAL if options.fisheye else GUESSED_FOCAL
+    focal_px = guess * max(width, height) if by_exif is None else by_exif.focal_px
     lens = Fisheye() if options.fisheye else None
     camera = Camera(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, lens)
     origin = f"nothing says its focal length{refusal}" if by_exif is None else "focal length by EXIF"
