@@ -86,7 +86,8 @@ def main() -> None:
         "seed": arguments.seed,
         "max_len": target.max_bytes,
         "timeout": _HANG_S,
-        "rss_limit_mb": 2048,
+        # The peak of the program that started this one, such as a worker of the tests, counts as its own.
+        "rss_limit_mb": 2048 + _peak_bytes() // 2**20,
         **({"dict": dictionary} if target.words else {}),
         "artifact_prefix": f"{arguments.output}/",
         "close_fd_mask": 2,  # what native decoders say of broken files would fill the disk
