@@ -18,7 +18,7 @@ from .wire import FieldError, joined
 _SENSORS: wire.ProtoEnum = pb.DepthSensor
 
 MIN_UNIT_M, MAX_UNIT_M = 1e-6, 100.0
-"""Of the values of depth images."""
+"""Bounds of the values of depth images."""
 MAX_APART_M, MAX_TURNED_DEG = 1.0, 45.0
 """From a photograph's camera to its depth camera, and between their viewing directions."""
 

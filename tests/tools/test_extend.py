@@ -38,7 +38,7 @@ from mapless_tools.extend.run import ALREADY, Extension
 from mapless_tools.reconstruct.pictures import Omitted
 
 UNIT = 2.0
-"""Of the scene, per metre: its unit is arbitrary."""
+"""Units of the scene per metre: its unit is arbitrary."""
 
 
 def half(it: Photograph, negative: bool = False) -> Photograph:

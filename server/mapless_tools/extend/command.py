@@ -9,6 +9,7 @@ import typer
 
 from mapless_server.serve.command import fail
 from mapless_tools.connection import Connection, Scene, with_flags
+from mapless_tools.reconstruct.command import FeaturesName, Frames, Lenses
 
 
 @with_flags
@@ -17,16 +18,9 @@ def extend_command(
     photos: Annotated[
         list[Path], typer.Argument(help="Videos, photographs and folders of photographs, without poses.")
     ],
-    frames: Annotated[int, typer.Option(help="Frames of all videos together, at most.")] = 150,
-    lens: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="fisheye|FILE",
-            help="fisheye: all lenses are. FILE: the intrinsics of a calibrated camera (JSON), used as they are for "
-            "photographs of its size. May be repeated.",
-        ),
-    ] = None,
-    features: Annotated[str, typer.Option(help="Local features, as the setting of the server names them.")] = "auto",
+    frames: Frames = 150,
+    lens: Lenses = None,
+    features: FeaturesName = "auto",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Place the photographs, store nothing.")] = False,
     report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
     work: Annotated[

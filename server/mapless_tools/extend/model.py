@@ -214,7 +214,7 @@ def with_free_lenses(model: pycolmap.Reconstruction, camera_ids: Collection[int]
 
 
 def without(fixed: Fixed, names: Collection[str], cameras: Collection[int] = ()) -> Fixed:
-    """What is known if the poses of some photographs and some cameras are not."""
+    """The rest of what is known, without the poses of some photographs and some cameras."""
     poses = {name: pose for name, pose in fixed.poses.items() if name not in names}
     return Fixed(poses, fixed.cameras - set(cameras))
 

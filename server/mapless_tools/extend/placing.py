@@ -1,4 +1,4 @@
-"""Which photographs are placed: their poses, cameras and accuracy, and why others are not."""
+"""Placed photographs: their poses, cameras and accuracy, and why others are not placed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is said of photographs that were placed, for people and for programs."""
+"""The report on photographs that were placed, for people and for programs."""
 
 from __future__ import annotations
 

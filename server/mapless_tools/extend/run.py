@@ -100,7 +100,7 @@ ALREADY = "it is in the scene already"
 def _similar(
     client: Client, scene: str, new: Sequence[Picture], count: int, options: ExtendOptions, progress: Progress
 ) -> tuple[frozenset[str] | None, dict[str, frozenset[str]]]:
-    """Of a large scene the references to use, and those of each photograph; None for all of a small one."""
+    """The references of a large scene to use, and those of each photograph; None for all of a small one."""
     if count + len(new) <= options.reconstruct.pairs.all_below:
         return None, {}
     cameras = {name: it.camera for it in starting_cameras(new, options.reconstruct.lens) for name in it.names}

@@ -11,6 +11,17 @@ from mapless_tools.connection import with_flags
 
 from .world.flags import WorldFlags
 
+Frames = Annotated[int, typer.Option(help="Frames of all videos together, at most.")]
+Lenses = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="fisheye|FILE",
+        help="fisheye: all lenses are. FILE: the intrinsics of a calibrated camera (JSON), used as they are for "
+        "photographs of its size. May be repeated.",
+    ),
+]
+FeaturesName = Annotated[str, typer.Option(help="Local features, as the setting of the server names them.")]
+
 
 @with_flags
 def reconstruct_command(
@@ -22,17 +33,10 @@ def reconstruct_command(
             show_default=False,
         ),
     ],
-    frames: Annotated[int, typer.Option(help="Frames of all videos together, at most.")] = 150,
-    lens: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="fisheye|FILE",
-            help="fisheye: all lenses are. FILE: the intrinsics of a calibrated camera (JSON), used as they are for "
-            "photographs of its size. May be repeated.",
-        ),
-    ] = None,
+    frames: Frames = 150,
+    lens: Lenses = None,
     part: Annotated[int, typer.Option(help="Which part to write, if the photographs show several places.")] = 1,
-    features: Annotated[str, typer.Option(help="Local features, as the setting of the server names them.")] = "auto",
+    features: FeaturesName = "auto",
     *,
     world: WorldFlags,
 ) -> None:
