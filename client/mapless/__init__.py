@@ -31,7 +31,7 @@ from .answers import (
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
 from .depth import DepthImage, DepthNoise, DepthSensor, IgnoredDepth
-from .diagnostics import Attempt, Debug, Diagnostics, LadderCut, ReferenceUse, ScaleEstimate
+from .diagnostics import Attempt, Debug, DepthCheck, Diagnostics, LadderCut, ReferenceUse, ScaleEstimate
 from .errors import (
     AlreadyExists,
     DataLoss,
@@ -81,6 +81,7 @@ __all__ = [
     "Datum",
     "DeadlineExceeded",
     "Debug",
+    "DepthCheck",
     "DepthImage",
     "DepthNoise",
     "DepthSensor",

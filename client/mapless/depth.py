@@ -142,11 +142,11 @@ class DepthImage:
 
 
 class IgnoredDepth(UserWarning):
-    """A server that is older than depth has stored a reference without it."""
+    """A server that is older than depth has ignored that of references, or of photographs."""
 
-    def __init__(self) -> None:
+    def __init__(self, owner: str = "references") -> None:
         super().__init__(
-            "the server has ignored the depth of references: it is older than depth, which 0.3 does not know"
+            f"the server has ignored the depth of {owner}: it is older than depth, which 0.3 does not know"
         )
 
 

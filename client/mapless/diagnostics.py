@@ -94,6 +94,31 @@ _CUT_REASONS = {
 
 
 @dataclass(frozen=True)
+class DepthCheck:
+    """How the depth that was measured with a photograph compares with its matches at the answered pose.
+
+    Attributes:
+        keypoint_count: keypoints of the photograph that have a depth; 0 where no attempt came so far.
+        compared_count: inliers of the pose with a depth, on points whose own depth does not come from this photograph.
+        agreeing_count: those of them whose depths agree within the errors of sensor and points, the common factor
+            removed.
+        factor: the most probable factor by which all measured depths are longer than those of the pose; 0 where nothing
+            was compared.
+        factor_sigma: its standard deviation, as a share.
+        conflict: whether the depths contradict the pose; then they were not used for it.
+        used: whether the depths contributed to the pose.
+    """
+
+    keypoint_count: int
+    compared_count: int
+    agreeing_count: int
+    factor: float
+    factor_sigma: float
+    conflict: bool
+    used: bool
+
+
+@dataclass(frozen=True)
 class Diagnostics:
     """Data and software that an answer was computed from, and the time it took.
 
@@ -113,6 +138,8 @@ class Diagnostics:
         attempts: the attempts that were made, in order; none of a server older than 0.4.
         ladder_cuts: attempts that were left out or not finished for lack of time or memory, or because others ask;
             asking again may help.
+        depth_check: how the photograph's depth compares with the answer; None without depth, and of a server before
+            0.4, which ignores it.
     """
 
     request_id: str
@@ -135,6 +162,7 @@ class Diagnostics:
     stationary_keypoint_count: int = 0
     attempts: tuple[Attempt, ...] = ()
     ladder_cuts: tuple[LadderCut, ...] = ()
+    depth_check: DepthCheck | None = None
 
     @property
     def is_tracked(self) -> bool:

@@ -5,6 +5,7 @@ from datetime import datetime
 
 from .answers import Accuracy, Hint, Hypothesis, PriorCheck, UsedIntrinsics, pose_lines, rejection_text
 from .axes import Axes, pose_to
+from .depth import DepthImage
 from .diagnostics import Diagnostics
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
@@ -24,6 +25,7 @@ class RigImage:
         references: the references to use, at most 64; empty: the server chooses.
         priors: priors on this camera's pose; soft ones are terms of the joint estimate.
         mask: a PNG of the photograph's size, 0 at the pixels to ignore; None: all are used.
+        depth: the depth that a sensor measured with the photograph; None without one.
     """
 
     image: ImageSource
@@ -32,6 +34,7 @@ class RigImage:
     references: tuple[str, ...] = ()
     priors: Priors = field(default_factory=Priors)
     mask: ImageSource | None = None
+    depth: DepthImage | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,7 @@ class SequenceFrame:
         references: the references to use, at most 64; empty: the server chooses.
         priors: priors on this camera's pose; soft ones are terms of the joint estimate.
         mask: a PNG of the photograph's size, 0 at the pixels to ignore; None: all are used.
+        depth: the depth that a sensor measured with the photograph; None without one.
     """
 
     image: ImageSource
@@ -56,6 +60,7 @@ class SequenceFrame:
     references: tuple[str, ...] = ()
     priors: Priors = field(default_factory=Priors)
     mask: ImageSource | None = None
+    depth: DepthImage | None = None
 
 
 @dataclass(frozen=True, eq=False)

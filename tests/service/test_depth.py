@@ -1,4 +1,4 @@
-"""Measured depth through a server: stored and returned with its reference, or refused by its field."""
+"""Measured depth through a server: kept with its reference, read with photographs, or refused by its field."""
 
 from dataclasses import replace
 
@@ -7,7 +7,17 @@ import pytest
 from support.depths import png
 from support.servers import CAMERA, PHOTO, pose
 
-from mapless import Client, DepthImage, DepthNoise, DepthSensor, InvalidArgument, NewReference, RigidTransform
+from mapless import (
+    Client,
+    DepthImage,
+    DepthNoise,
+    DepthSensor,
+    InvalidArgument,
+    NewReference,
+    RigidTransform,
+    RigImage,
+    SequenceFrame,
+)
 from mapless.geometry import rotation_from_vector
 
 STEPS = np.full((CAMERA.height_px, CAMERA.width_px), 1500, np.uint16)
@@ -64,3 +74,34 @@ def test_no_depth_is_implausible_in_an_arbitrary_unit(client: Client, scene: str
     client.update_scene(scene, arbitrary_unit=True)
     warnings = client.add_reference(scene, new(replace(DEPTH, unit_m=1.0))).warnings
     assert not any("median depth" in it for it in warnings)
+
+
+def test_answers_of_photographs_with_depth_have_a_depth_check(client: Client, scene: str) -> None:
+    assert client.localize(PHOTO, CAMERA, scene, depth=DEPTH).diagnostics.depth_check is not None
+    assert client.localize(PHOTO, CAMERA, scene).diagnostics.depth_check is None
+    images = [RigImage(PHOTO, CAMERA, pose(0.0), depth=depth) for depth in (DEPTH, None)]
+    reports = client.localize_rig(images, scene).images
+    assert [it.diagnostics.depth_check is None for it in reports] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "reason"),
+    [
+        ({"data": png(STEPS[:-1])}, "intrinsics", "DEPTH_SIZE"),
+        ({"data": png(STEPS.astype(np.uint8))}, "png", "DEPTH_UNSUPPORTED"),
+        ({"confidence": png(np.full((9, 9), 2, np.uint8))}, "confidence", "DEPTH_SIZE"),
+        ({"unit_m": 0.0}, "unit_m", "INVALID_ARGUMENT"),
+    ],
+    ids=["another size", "8 bits", "confidence of another size", "no unit"],
+)
+def test_a_wrong_depth_of_a_photograph_is_refused(
+    client: Client, scene: str, change: dict[str, object], field: str, reason: str
+) -> None:
+    depth = replace(DEPTH, **change)  # type: ignore[arg-type]
+    with pytest.raises(InvalidArgument) as raised:
+        client.localize(PHOTO, CAMERA, scene, depth=depth)
+    assert (raised.value.field, raised.value.reason) == (f"depth.{field}", reason)
+    frames = [SequenceFrame(PHOTO, CAMERA, pose(0.0), depth=it) for it in (None, depth)]
+    with pytest.raises(InvalidArgument) as raised:
+        client.localize_sequence(frames, scene)
+    assert raised.value.field == f"frames[1].depth.{field}"

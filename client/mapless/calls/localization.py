@@ -1,5 +1,6 @@
 """Localization of one photograph, of a rig's photographs, and of a sequence."""
 
+import warnings
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import aclosing
 from dataclasses import asdict, replace
@@ -11,8 +12,9 @@ from .. import wire
 from ..answers import LocalizationResult, Rejected
 from ..axes import Axes
 from ..connection import Connection
+from ..depth import DepthImage, IgnoredDepth, depth_to_message
 from ..geometry import Camera, RigidTransform
-from ..groups import GroupRejected, RigImage, RigLocalization, SequenceFrame, SequenceLocalization
+from ..groups import GroupRejected, ImageReport, RigImage, RigLocalization, SequenceFrame, SequenceLocalization
 from ..messages import answer_from_message, rig_from_message, sequence_from_message
 from ..names import reference_names, scene_name
 from ..priors import Priors, set_priors
@@ -47,6 +49,7 @@ async def _localize_request(
     capture_time: datetime | None = None,
     session_from_camera: RigidTransform | None = None,
     mask: ImageSource | None = None,
+    depth: DepthImage | None = None,
     timeout_s: float | None = None,
 ) -> pb.LocalizeRequest:
     """Localizes a photograph: estimates the pose of its camera.
@@ -84,6 +87,8 @@ async def _localize_request(
             `LocalizationResult.world_from_session`.
         mask: a PNG of the photograph's size, or its path, that is 0 at the pixels to ignore, which show nothing of the
             place: the camera's own vehicle, gripper or badge, or people; None: all are used.
+        depth: the depth that a sensor measured with the photograph; None without one.
+            `Diagnostics.depth_check` says how it compares with the answer.
         timeout_s: deadline of the call.
     """
     scene = scene_name(scene)
@@ -93,6 +98,7 @@ async def _localize_request(
         image=await connection.unblocked(read_image, image),
         mask=await connection.unblocked(read_mask, mask),
         intrinsics=None if camera is None else wire.camera_to_message(camera),
+        depth=None if depth is None else depth_to_message(depth),
         options=_options_to_message(
             variant=wire.enum_value(pb.Variant, variant),
             scale_strategy=wire.enum_value(pb.ScaleStrategy, scale_strategy),
@@ -139,7 +145,9 @@ async def localize(  # noqa: D103, it has the docstring of the request
     connection: Connection, *asked: Any, **named: Any
 ) -> LocalizationResult | Rejected:
     request = await _localize_request(connection, *asked, **named)
-    return await connection.call("Localize", request, answer_from_message, named.get("timeout_s"))
+    answer = await connection.call("Localize", request, answer_from_message, named.get("timeout_s"))
+    _check_depths([request], [answer])
+    return answer
 
 
 @_asked_like(_localize_request)
@@ -161,6 +169,8 @@ async def localize_progressively(
     request, timeout_s = await _localize_request(connection, *asked, **named), named.get("timeout_s")
     async with aclosing(connection.streamed("LocalizeProgressively", request, _streamed, timeout_s)) as answers:
         async for answer in answers:
+            if answer.is_final:
+                _check_depths([request], [answer])
             yield answer
 
 
@@ -219,7 +229,9 @@ async def localize_rig(
         wire.set_time(request.capture_time, capture_time, "capture_time")
     if session_from_rig is not None:
         request.session_from_rig.CopyFrom(wire.transform_to_message(session_from_rig, "session_from_rig"))
-    return await connection.call("LocalizeRig", request, rig_from_message, timeout_s)
+    answer = await connection.call("LocalizeRig", request, rig_from_message, timeout_s)
+    _check_depths(request.images, answer.images)
+    return answer
 
 
 async def localize_sequence(
@@ -267,7 +279,19 @@ async def localize_sequence(
         ),
     )
     wire.set_numbers(request, {"estimate_session_scale": estimate_session_scale})
-    return await connection.call("LocalizeSequence", request, sequence_from_message, timeout_s)
+    answer = await connection.call("LocalizeSequence", request, sequence_from_message, timeout_s)
+    _check_depths(request.frames, answer.images)
+    return answer
+
+
+def _check_depths(
+    requests: Sequence[Any],
+    answers: Sequence[LocalizationResult | Rejected | ImageReport],
+) -> None:
+    """Warns if a server has ignored the depth of photographs, in these messages, because it is too old to know it."""
+    both = zip(requests, answers, strict=True)
+    if any(it.HasField("depth") and answer.diagnostics.depth_check is None for it, answer in both):
+        warnings.warn(IgnoredDepth("photographs"), stacklevel=2)
 
 
 def _uncertainty_to_message(uncertainty: IntrinsicsUncertainty) -> pb.IntrinsicsUncertainty:
@@ -288,6 +312,8 @@ def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: s
     mask = read_mask(given.mask, f"{field}.mask")
     if mask is not None:
         message.mask = mask
+    if given.depth is not None:
+        message.depth.CopyFrom(depth_to_message(given.depth, f"{field}.depth"))
     if given.camera is not None:
         message.intrinsics.CopyFrom(wire.camera_to_message(given.camera, f"{field}.camera"))
     message.references.extend(reference_names(scene, given.references))

@@ -287,6 +287,27 @@ def _add_place(command: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_depth(command: argparse.ArgumentParser) -> None:
+    """Adds the flags that `commands.depth_of` reads."""
+    command.add_argument(
+        "--depth", type=Path, metavar="FILE", help="its depth: a PNG of 16 bits, of the same camera or --depth-camera"
+    )
+    command.add_argument(
+        "--depth-unit", type=float, metavar="M", help="metres of 1 in it (default: 0.001, millimetres)"
+    )
+    command.add_argument(
+        "--depth-sensor",
+        choices=[it.value for it in DepthSensor],
+        help="the kind of sensor, by which its errors are known (default: unknown)",
+    )
+    command.add_argument(
+        "--depth-camera", metavar="CAMERA", help="the camera of the depth, if it is another, as --camera"
+    )
+    command.add_argument(
+        "--depth-pose", metavar="POSE", help="camera_from_depth_camera, if that is elsewhere, in the form of --pose"
+    )
+
+
 def _add_reference(reference: argparse.ArgumentParser) -> None:
     actions = reference.add_subparsers(required=True, metavar="ACTION")
     add = actions.add_parser("add", help="store a photograph with its camera and pose")
@@ -296,19 +317,7 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     add.add_argument("--camera", required=True, help="its camera, see `mapless --help`")
     add.add_argument("--pose", required=True, help="its world_from_camera, likewise")
     add.add_argument("--mask", type=Path, metavar="FILE", help=f"{_MASK}")
-    add.add_argument(
-        "--depth", type=Path, metavar="FILE", help="its depth: a PNG of 16 bits, of the same camera or --depth-camera"
-    )
-    add.add_argument("--depth-unit", type=float, metavar="M", help="metres of 1 in it (default: 0.001, millimetres)")
-    add.add_argument(
-        "--depth-sensor",
-        choices=[it.value for it in DepthSensor],
-        help="the kind of sensor, by which its errors are known (default: unknown)",
-    )
-    add.add_argument("--depth-camera", metavar="CAMERA", help="the camera of the depth, if it is another, as --camera")
-    add.add_argument(
-        "--depth-pose", metavar="POSE", help="camera_from_depth_camera, if that is elsewhere, in the form of --pose"
-    )
+    _add_depth(add)
     add.set_defaults(run=commands.add_reference)
     listing = actions.add_parser("list", help="all references of a scene")
     listing.add_argument("scene")
@@ -347,6 +356,7 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=f"{_MASK}; or a folder of masks, PHOTO.jpg.png (default: those that the folder's cameras.json names)",
     )
+    _add_depth(command)
     command.add_argument("--reference", action="append", default=[], help="use this reference; may be repeated")
     command.add_argument(
         "--count", type=_count, default=0, help=f"how many references the server chooses {_COUNT_DEFAULT}"

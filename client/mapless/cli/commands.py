@@ -8,7 +8,6 @@ from typing import Any
 
 from ..cameras import read_camera, read_pose
 from ..client import Client
-from ..depth import DepthImage, DepthSensor
 from ..geodesy import Datum
 from ..geometry import Quaternion, RigidTransform
 from ..lenses import lens_model_of
@@ -18,7 +17,7 @@ from ..provenance import GIVEN, PLACED, Provenance
 from ..requests import NewReference
 from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
-from .localize import limits
+from .localize import depth_of, limits
 from .output import card, is_confirmed, serving_states, show, table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
@@ -128,29 +127,13 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
         camera=read_camera(arguments.camera, arguments.photo),
         world_from_camera=read_pose(arguments.pose),
         mask=arguments.mask,
-        depth=_depth(arguments),
+        depth=depth_of(arguments),
     )
     stored = client.add_reference(arguments.scene, reference)
     if not stored.feature_count:
         print(f"mapless: warning: {arguments.photo} is stored, but has no local features: {_BLANK}", file=sys.stderr)
     _warn(stored.warnings)
     return show(arguments, stored, _reference_card(stored))
-
-
-def _depth(arguments: argparse.Namespace) -> DepthImage | None:
-    """The depth that was measured with a photograph; None without one."""
-    if arguments.depth is None:
-        for name in ("unit", "sensor", "camera", "pose"):
-            if getattr(arguments, f"depth_{name}") is not None:
-                raise ValueError(f"--depth-{name} says something of a depth: give --depth, too")
-        return None
-    return DepthImage(
-        arguments.depth.read_bytes(),
-        0.001 if arguments.depth_unit is None else arguments.depth_unit,
-        sensor=DepthSensor(arguments.depth_sensor or DepthSensor.UNKNOWN),
-        camera=None if arguments.depth_camera is None else read_camera(arguments.depth_camera, arguments.depth),
-        camera_from_depth_camera=None if arguments.depth_pose is None else read_pose(arguments.depth_pose),
-    )
 
 
 def _id_of(photo: Path) -> str:

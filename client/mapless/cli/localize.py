@@ -16,6 +16,7 @@ import numpy as np
 from ..answers import LocalizationResult, Rejected
 from ..cameras import FOLDER_FILE, read_camera, read_cameras, read_masks, read_pose
 from ..client import Client
+from ..depth import DepthImage, DepthSensor
 from ..errors import InvalidArgument, MaplessError
 from ..geometry import Camera
 from ..masks import find_mask, mask_name
@@ -25,7 +26,7 @@ from . import output
 from .folder import EXIT_REJECTED, Concurrency, LimitedClient, Outcome, Tally
 
 ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".webp"})
-_FIELDS_OF_PHOTOS = ("image", "intrinsics", "mask")
+_FIELDS_OF_PHOTOS = ("image", "intrinsics", "mask", "depth")
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
         return _one(client, arguments)
     if arguments.progressive:
         raise ValueError("--progressive takes one photograph, not a folder")
+    if depth_of(arguments) is not None:
+        raise ValueError("--depth is that of one photograph, not of a folder's")
     return _folder(client, arguments)
 
 
@@ -100,6 +103,22 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
 def _print_path(arguments: argparse.Namespace) -> None:
     if arguments.output is not None:
         print(f"answers are in {arguments.output}", file=sys.stderr)
+
+
+def depth_of(arguments: argparse.Namespace) -> DepthImage | None:
+    """The depth that was measured with a photograph, by the flags of `--depth`; None without one."""
+    if arguments.depth is None:
+        for name in ("unit", "sensor", "camera", "pose"):
+            if getattr(arguments, f"depth_{name}") is not None:
+                raise ValueError(f"--depth-{name} says something of a depth: give --depth, too")
+        return None
+    return DepthImage(
+        arguments.depth.read_bytes(),
+        0.001 if arguments.depth_unit is None else arguments.depth_unit,
+        sensor=DepthSensor(arguments.depth_sensor or DepthSensor.UNKNOWN),
+        camera=None if arguments.depth_camera is None else read_camera(arguments.depth_camera, arguments.depth),
+        camera_from_depth_camera=None if arguments.depth_pose is None else read_pose(arguments.depth_pose),
+    )
 
 
 def photos_of(folder: Path, camera: str | None) -> list[Photo]:
@@ -203,6 +222,7 @@ def _answers(
     options: dict[str, Any] = {
         "priors": priors(arguments),
         "mask": mask,
+        "depth": depth_of(arguments),
         "intrinsics_uncertainty": intrinsics_uncertainty(arguments),
         "variant": arguments.variant,
         "allow_coarse": arguments.allow_coarse,

@@ -197,7 +197,7 @@ SCALE_STAGE_NETWORK: ScaleStage
 SCALE_STAGE_DEPTH: ScaleStage
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "intrinsics_uncertainty", "mask")
+    __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "intrinsics_uncertainty", "mask", "depth")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
@@ -212,6 +212,7 @@ class LocalizeRequest(_message.Message):
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
     MASK_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
     scene: str
     references: _containers.RepeatedScalarFieldContainer[str]
     image: bytes
@@ -226,7 +227,8 @@ class LocalizeRequest(_message.Message):
     pose_prior: PosePrior
     intrinsics_uncertainty: IntrinsicsUncertainty
     mask: bytes
-    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ..., mask: _Optional[bytes] = ...) -> None: ...
+    depth: _geometry_pb2.DepthImage
+    def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ...) -> None: ...
 
 class IntrinsicsUncertainty(_message.Message):
     __slots__ = ("focal_sigma_px", "principal_sigma_px", "k1_sigma")
@@ -531,7 +533,7 @@ class Hypothesis(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., inlier_count: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., arbitrary_unit: bool = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ...) -> None: ...
 
 class Diagnostics(_message.Message):
-    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "attempts", "stationary_keypoint_count", "ladder_cuts")
+    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "attempts", "stationary_keypoint_count", "ladder_cuts", "depth_check")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     BACKEND_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -552,6 +554,7 @@ class Diagnostics(_message.Message):
     ATTEMPTS_FIELD_NUMBER: _ClassVar[int]
     STATIONARY_KEYPOINT_COUNT_FIELD_NUMBER: _ClassVar[int]
     LADDER_CUTS_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_CHECK_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     backend: str
     weights_sha256: str
@@ -572,7 +575,26 @@ class Diagnostics(_message.Message):
     attempts: _containers.RepeatedCompositeFieldContainer[Attempt]
     stationary_keypoint_count: int
     ladder_cuts: _containers.RepeatedCompositeFieldContainer[LadderCut]
-    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ..., ladder_cuts: _Optional[_Iterable[_Union[LadderCut, _Mapping]]] = ...) -> None: ...
+    depth_check: DepthCheck
+    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ..., ladder_cuts: _Optional[_Iterable[_Union[LadderCut, _Mapping]]] = ..., depth_check: _Optional[_Union[DepthCheck, _Mapping]] = ...) -> None: ...
+
+class DepthCheck(_message.Message):
+    __slots__ = ("keypoint_count", "compared_count", "agreeing_count", "factor", "factor_sigma", "conflict", "used")
+    KEYPOINT_COUNT_FIELD_NUMBER: _ClassVar[int]
+    COMPARED_COUNT_FIELD_NUMBER: _ClassVar[int]
+    AGREEING_COUNT_FIELD_NUMBER: _ClassVar[int]
+    FACTOR_FIELD_NUMBER: _ClassVar[int]
+    FACTOR_SIGMA_FIELD_NUMBER: _ClassVar[int]
+    CONFLICT_FIELD_NUMBER: _ClassVar[int]
+    USED_FIELD_NUMBER: _ClassVar[int]
+    keypoint_count: int
+    compared_count: int
+    agreeing_count: int
+    factor: float
+    factor_sigma: float
+    conflict: bool
+    used: bool
+    def __init__(self, keypoint_count: _Optional[int] = ..., compared_count: _Optional[int] = ..., agreeing_count: _Optional[int] = ..., factor: _Optional[float] = ..., factor_sigma: _Optional[float] = ..., conflict: bool = ..., used: bool = ...) -> None: ...
 
 class LadderCut(_message.Message):
     __slots__ = ("rung", "features", "reason", "unmatched_reference_count")
@@ -671,7 +693,7 @@ class LocalizeRigRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., images: _Optional[_Iterable[_Union[RigImage, _Mapping]]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
 
 class RigImage(_message.Message):
-    __slots__ = ("image", "intrinsics", "rig_from_camera", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask")
+    __slots__ = ("image", "intrinsics", "rig_from_camera", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask", "depth")
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     RIG_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -682,6 +704,7 @@ class RigImage(_message.Message):
     GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     MASK_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     rig_from_camera: _geometry_pb2.RigidTransform
@@ -692,7 +715,8 @@ class RigImage(_message.Message):
     gravity_prior: GravityPrior
     pose_prior: PosePrior
     mask: bytes
-    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ...) -> None: ...
+    depth: _geometry_pb2.DepthImage
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ...) -> None: ...
 
 class LocalizeRigResponse(_message.Message):
     __slots__ = ("localization", "rejection", "images", "capture_time", "session_from_rig")
@@ -761,7 +785,7 @@ class LocalizeSequenceRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., estimate_session_scale: bool = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ...) -> None: ...
 
 class SequenceFrame(_message.Message):
-    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask")
+    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask", "depth")
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -773,6 +797,7 @@ class SequenceFrame(_message.Message):
     GRAVITY_PRIOR_FIELD_NUMBER: _ClassVar[int]
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     MASK_FIELD_NUMBER: _ClassVar[int]
+    DEPTH_FIELD_NUMBER: _ClassVar[int]
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     session_from_camera: _geometry_pb2.RigidTransform
@@ -784,7 +809,8 @@ class SequenceFrame(_message.Message):
     gravity_prior: GravityPrior
     pose_prior: PosePrior
     mask: bytes
-    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ...) -> None: ...
+    depth: _geometry_pb2.DepthImage
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ...) -> None: ...
 
 class LocalizeSequenceResponse(_message.Message):
     __slots__ = ("localization", "rejection", "images")

@@ -111,7 +111,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             for echoed in ("capture_time", "session_from_camera"):
                 if request.HasField(echoed):
                     getattr(response, echoed).CopyFrom(getattr(request, echoed))
-            response.diagnostics.CopyFrom(diagnostics_to_message(result, query.options))
+            response.diagnostics.CopyFrom(diagnostics_to_message(result, query))
             response.diagnostics.request_id = call.request_id
             response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * sum(it.waited_s for it in records)))
             response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))

@@ -8,7 +8,7 @@ from mapless.geodesy import Datum, geopose
 from mapless.geometry import Array, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server import __version__
-from mapless_server.engine.query import Photo, Result
+from mapless_server.engine.query import Photo, Query, Result
 from mapless_server.method.bundle.estimate import (
     PosedSupport,
     accuracy_from_covariance,
@@ -181,14 +181,14 @@ def _hypothesis_to_message(hypothesis: PoseHypothesis) -> pb.Hypothesis:
     )
 
 
-def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagnostics:
+def diagnostics_to_message(result: Result, query: Query) -> pb.Diagnostics:
     """Message of what was used and of the stages' times, without the call's id and durations."""
     answer, tier = result.answer, result.tier
     message = pb.Diagnostics(
         backend=tier.backend,
         weights_sha256=tier.weights_sha256,
         features=tier.features,
-        variant=enum_to_message(options.variant, pb.Variant),
+        variant=enum_to_message(query.options.variant, pb.Variant),
         store_generation=result.generation,
         scale=message_of(answer.scale, pb.ScaleEstimate) if answer.scale else None,
         processed_width_px=result.processed.width_px,
@@ -197,6 +197,8 @@ def diagnostics_to_message(result: Result, options: LocalizeOptions) -> pb.Diagn
         retrieval=result.choice.descriptor if result.choice else "",
         stationary_keypoint_count=answer.stationary_count,
     )
+    if query.photo.depth is not None:
+        message.depth_check.CopyFrom(message_of(answer.depth_check, pb.DepthCheck))
     message.references.extend(_reference_uses(result))
     for stage, seconds in result.stage_seconds.items():
         message.stages.add(stage=stage).duration.FromNanoseconds(round(1e9 * seconds))

@@ -45,6 +45,7 @@ from .queries import (
     priors_from_message,
     reference_count_from_message,
     reference_ids_from_names,
+    with_depth,
 )
 from .radii import ReportedRadii
 
@@ -88,11 +89,12 @@ def queries_from_message(
                 check_capture_time(message)
             reference_ids = reference_ids_from_names(message.references, scene_id, most_references)
             narrowing, priors = priors_from_message(message, attributes)
+        photo = photo_from_message(message, path, engine.image_limits, needs_intrinsics=False)
         queries.append(
             Query(
                 scene_key=key_of(tenant, scene_id),
                 reference_ids=reference_ids,
-                photo=photo_from_message(message, path, engine.image_limits, needs_intrinsics=False),
+                photo=with_depth(photo, message, path, engine.image_limits),
                 narrowing=narrowing,
                 reference_count=count,
                 options=options,
@@ -262,7 +264,7 @@ def _reports(
     reports = []
     for i, (result, query) in enumerate(zip(group.results, queries, strict=True)):
         alone = result.answer
-        report = pb.ImageReport(diagnostics=diagnostics_to_message(result, query.options))
+        report = pb.ImageReport(diagnostics=diagnostics_to_message(result, query))
         report.diagnostics.queue_duration.FromNanoseconds(round(1e9 * group.queued_s[i]))
         report.diagnostics.total_duration.FromNanoseconds(round(1e9 * group.seconds[i]))
         report.diagnostics.processor_duration.FromNanoseconds(round(1e9 * group.processor_s[i]))

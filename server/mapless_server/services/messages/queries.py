@@ -192,6 +192,7 @@ def query_from_message(
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
     narrowing, priors = priors_from_message(request, attributes)
     photo = photo_from_message(request, "", engine.image_limits, needs_intrinsics=False)
+    photo = with_depth(photo, request, "", engine.image_limits)
     return Query(
         scene_key=key_of(tenant, scene_id),
         reference_ids=reference_ids_from_names(request.references, scene_id, most),
