@@ -165,6 +165,15 @@ _SOURCES = {
 }
 
 
+POINT_SOURCES = {
+    "TRIANGULATED": "triangulated",
+    "MEASURED_DEPTH": "by measured depth",
+    "KEPT_DEPTH": "by kept depth",
+    "NETWORK_DEPTH": "by a network's depth",
+}
+"""Words for the sources of points; see `Debug.source`."""
+
+
 @dataclass(frozen=True)
 class Hint:
     """Advice after a rejection.
@@ -274,6 +283,9 @@ class LocalizationResult:
         captured = f", {_CAPTURED}" if self.diagnostics.captured else ""
         tracked = ", tracked" if self.diagnostics.is_tracked else ""
         text.append(f"  support   {_support(self)}, {self.diagnostics.total_s:.2f} s{tracked}{captured}")
+        if self.debug is not None and (counts := self.debug.inliers_by_source()):
+            points = ", ".join(f"{count} {POINT_SOURCES.get(it, it)}" for it, count in counts.items() if count)
+            text.append(f"  points    {points}")
         text += [f"  cut       {it}" for it in self.diagnostics.ladder_cuts]
         if self.arbitrary_unit:
             text.append("  warning   the scene's unit of length is arbitrary, not the metre")

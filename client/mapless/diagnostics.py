@@ -1,7 +1,7 @@
 """Data that an answer was computed from: references, matches, attempts, software and times."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,6 +181,8 @@ class Debug:
         error_px: (M,) reprojection errors, pixels of the processed image; NaN if undefined.
         reference: (M,) index into `Diagnostics.references` of a reference that shows the point.
         reference_px: (M, 2) the point's pixel in that reference.
+        source: (M,) what gives the point its distance, the value of PointSource without its prefix: "TRIANGULATED",
+            "MEASURED_DEPTH", "KEPT_DEPTH" or "NETWORK_DEPTH"; (0,) from servers older than 0.4.
     """
 
     query_px: Array
@@ -189,3 +191,8 @@ class Debug:
     error_px: Array
     reference: NDArray[np.intp]
     reference_px: Array
+    source: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, np.str_))
+
+    def inliers_by_source(self) -> dict[str, int]:
+        """Number of inliers of each source that a match has; empty from servers older than 0.4."""
+        return {str(it): int(self.is_inlier[self.source == it].sum()) for it in np.unique(self.source)}

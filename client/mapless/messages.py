@@ -89,6 +89,7 @@ def _debug(message: pb.Debug, path: str) -> Debug:
     def columns(*fields: str) -> Array:
         return np.stack([np.array(getattr(message, field), float) for field in fields], axis=1)
 
+    sources = message.DESCRIPTOR.fields_by_name["source"].enum_type
     return Debug(
         query_px=columns("query_x_px", "query_y_px"),
         x_in_world=columns("point_x_m", "point_y_m", "point_z_m"),
@@ -96,6 +97,7 @@ def _debug(message: pb.Debug, path: str) -> Debug:
         error_px=np.array(message.error_px, float),
         reference=np.array(message.reference, np.intp),
         reference_px=columns("reference_x_px", "reference_y_px"),
+        source=np.array([wire.value_name(sources, it) for it in message.source], np.str_),
     )
 
 

@@ -1,10 +1,11 @@
 """Photographs and their matches as pictures.
 
-Everywhere, a match that agrees with a pose is green, and any other is orange. Drawn with matplotlib, without pyplot's
-global state.
+Everywhere, a match that agrees with a pose is green, or has the colour of its point's source, and any other is orange.
+Drawn with matplotlib, without pyplot's global state.
 """
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +17,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
+from mapless.diagnostics import Debug
 from mapless.geometry import Array, Camera, resized_pixel
 from mapless_server.images import ImageLimits, decode_image
 
@@ -23,6 +25,13 @@ Picture = NDArray[np.uint8]
 """Pixels (H, W, 3), RGB."""
 GOOD, WRONG = "#2ee6a6", "#ff6b2b"
 """Colours of matches that agree with a pose, and of those that do not."""
+SOURCE_COLOURS = {
+    "TRIANGULATED": ("green", GOOD),
+    "MEASURED_DEPTH": ("blue", "#4aa8ff"),
+    "KEPT_DEPTH": ("yellow", "#ffd23f"),
+    "NETWORK_DEPTH": ("white", "#f4f4f4"),
+}
+"""Names and colours of matches that agree with a pose, by the sources of their points; see `Debug.source`."""
 RESIDUAL = "#ff4df0"
 MAX_GOOD, MAX_WRONG = 140, 30
 """Most lines of a pair of photographs; more hide one another."""
@@ -71,6 +80,11 @@ class Shot:
         return _moved(pixels, self.camera.width_px / camera.width_px, self.camera.height_px / camera.height_px)
 
 
+def source_colours(debug: Debug) -> list[str]:
+    """The colour (M,) of each match as one that agrees with the pose."""
+    return [SOURCE_COLOURS.get(it, ("", GOOD))[1] for it in debug.source] or [GOOD] * len(debug.is_inlier)
+
+
 def axes_on(picture: Picture) -> Axes:
     """Axes in the pixels of a picture, on which to draw; `rendered` gives the result, of the same size."""
     height, width = picture.shape[:2]
@@ -99,7 +113,12 @@ def add_lines(axes: Axes, ends: Array, **style: Any) -> None:
 
 
 def draw_matches(
-    axes: Axes, pixels: Array, projected: Array | None, is_good: NDArray[np.bool_], depth: Array | None = None
+    axes: Axes,
+    pixels: Array,
+    projected: Array | None,
+    is_good: NDArray[np.bool_],
+    depth: Array | None = None,
+    colours: Sequence[str] | None = None,
 ) -> int:
     """Draws the matches of a photograph that the axes show.
 
@@ -111,7 +130,8 @@ def draw_matches(
         pixels: (M, 2) the keypoints.
         projected: (M, 2) the projections of their points, NaN behind the camera; None without a pose.
         is_good: (M,) whether the match agrees with the pose.
-        depth: (M,) colours good ones in its order, near red and far blue; None for green.
+        depth: (M,) colours good ones in its order, near red and far blue; None for `colours`.
+        colours: (M,) of those that are good; None for green.
     """
     width_px = float(np.ptp(axes.get_xlim()))
     unit = axes.get_window_extent().width / 1000 * 72 / _DPI  # a thousandth of the width, in points
@@ -127,7 +147,7 @@ def draw_matches(
         add_lines(axes, ends[is_good], color=RESIDUAL, linewidth=1.6 * unit)
     wrong, good = pixels[~is_good], pixels[is_good]
     axes.scatter(wrong[:, 0], wrong[:, 1], marker="x", c=WRONG, s=(7 * unit) ** 2, linewidths=1.5 * unit)
-    style: dict[str, Any] = {"c": GOOD}
+    style: dict[str, Any] = {"c": GOOD if colours is None else np.asarray(colours)[is_good]}
     if depth is not None:  # its rank: every step of it is to be seen
         rank = np.argsort(np.argsort(-depth[is_good]))
         style = {"c": rank, "cmap": "turbo", "vmin": -0.18 * len(rank), "vmax": 1.05 * len(rank)}
@@ -146,12 +166,19 @@ def magnification(residual: Array, width_px: float) -> int:
 
 
 def side_by_side(
-    left: Shot, right: Shot, left_px: Array, right_px: Array, is_good: NDArray[np.bool_], height_px: int = 480
+    left: Shot,
+    right: Shot,
+    left_px: Array,
+    right_px: Array,
+    is_good: NDArray[np.bool_],
+    height_px: int = 480,
+    colours: Sequence[str] | None = None,
 ) -> Picture:
     """Draws two photographs at one height, with lines from pixels (M, 2) of one image to those of the other.
 
-    Of very many, some from left to right are drawn.
+    Of very many, some from left to right are drawn; good ones in their `colours` (M,), None for green.
     """
+    of_good = np.asarray([GOOD] * len(is_good) if colours is None else colours)
     scales = [height_px / it.image.shape[0] for it in (left, right)]
     images = [
         _resized(it.image, max(1, round(it.image.shape[1] * scale)), height_px)
@@ -162,10 +189,13 @@ def side_by_side(
     start = _moved(left_px, images[0].shape[1] / left.image.shape[1], scales[0])
     end = _moved(right_px, images[1].shape[1] / right.image.shape[1], scales[1]) + (images[0].shape[1] + _GAP_PX, 0)
     ends = np.stack([start, end], axis=1)
-    for rows, count, colour, alpha in ((~is_good, MAX_WRONG, WRONG, 0.6), (is_good, MAX_GOOD, GOOD, 0.75)):
-        drawn = ends[_some(rows, start[:, 0], count)]
-        add_lines(axes, drawn, color=colour, linewidth=0.9, alpha=alpha)
-        axes.scatter(drawn[..., 0], drawn[..., 1], c=colour, s=9, linewidths=0.6, edgecolors="#06251b")
+    of_wrong = np.full_like(of_good, WRONG)
+    for rows, count, colour, alpha in ((~is_good, MAX_WRONG, of_wrong, 0.6), (is_good, MAX_GOOD, of_good, 0.75)):
+        some = _some(rows & np.isfinite(ends).all(axis=(1, 2)), start[:, 0], count)
+        add_lines(axes, ends[some], color=colour[some], linewidth=0.9, alpha=alpha)
+        for side in (0, 1):
+            x, y = ends[some, side].T
+            axes.scatter(x, y, c=colour[some], s=9, linewidths=0.6, edgecolors="#06251b")
     return rendered(axes.figure)
 
 

@@ -10,12 +10,14 @@ import pytest
 from support.planted import true_structure
 from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, random_for
 
-from mapless.geometry import Array, Camera, RigidTransform
+from mapless.geometry import Array, Camera, RigidTransform, Similarity
 from mapless.lenses import Fisheye, RadialTangential
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage, Support
-from mapless_server.method.features.views import Photograph, PosedView, View
+from mapless_server.method.features.tracks import Tracks
+from mapless_server.method.features.views import DepthSource, KeypointDepths, Photograph, PosedView, View
 from mapless_server.method.pose.pnp import PnpOptions
+from mapless_server.method.structure.model import DepthPlanes, MetricScale, ScaleStage
 from mapless_server.services.messages.debug import MAX_MATCHES, debug_to_message
 
 ORIGIN = np.array([4000.0, -200.0, 30.0])
@@ -133,6 +135,52 @@ def test_where_there_are_too_many_the_inliers_stay() -> None:
     assert len(debug.query_x_px) == len(debug.reference) == len(debug.error_px) == MAX_MATCHES
     assert sum(debug.is_inlier) == inliers
     assert debug.ByteSize() < 130_000
+
+
+def test_a_point_has_the_source_of_its_distance() -> None:
+    """Every second point is seen by its first reference alone, with a depth: measured of the first, kept of others."""
+    scene = make_scene(random_for("debug sources"))
+    support = support_of(scene, SENT, scene.world_from_query)
+    tracks, count = support.structure.tracks, len(support.structure.x_in_world)
+    first = tracks.starts[1::2]
+    alone = np.zeros(count, bool)
+    alone[1::2] = True
+    kept = ~alone[tracks.point]
+    kept[first] = True
+    views = tracks.view[tracks.starts]
+    few = Tracks(tracks.point[kept], tracks.view[kept], tracks.keypoint[kept])
+    nothing = DepthPlanes.unknown(count)
+    planes = replace(nothing, information=np.ones(count), view=views)
+    references = tuple(
+        replace(it, depths=KeypointDepths(np.ones(1, np.float32), np.ones(1, np.float32), 0.02, source))
+        for it, source in zip(support.references, [DepthSource.MEASURED, *[DepthSource.NETWORK] * 99], strict=False)
+    )
+    debug = debug_to_message(
+        replace(support, structure=replace(support.structure, tracks=few, planes=planes), references=references)
+    )
+    point = support.matches.point
+    expected = np.where(views == 0, pb.POINT_SOURCE_MEASURED_DEPTH, pb.POINT_SOURCE_KEPT_DEPTH)
+    np.testing.assert_array_equal(debug.source, np.where(alone, expected, pb.POINT_SOURCE_TRIANGULATED)[point])
+    assert len(set(debug.source)) == 3
+
+
+@pytest.mark.parametrize(
+    ("stage", "is_measured", "source"),
+    [
+        (ScaleStage.DEPTH, True, pb.POINT_SOURCE_MEASURED_DEPTH),
+        (ScaleStage.DEPTH, False, pb.POINT_SOURCE_KEPT_DEPTH),
+        (ScaleStage.NETWORK, False, pb.POINT_SOURCE_NETWORK_DEPTH),
+    ],
+)
+def test_points_of_one_reference_have_the_source_of_its_scale(
+    stage: ScaleStage, is_measured: bool, source: int
+) -> None:
+    scene = make_scene(random_for("debug one reference"))
+    scale = MetricScale(
+        1.0, stage, 0.0, 0, Similarity(1.0, np.eye(3), np.zeros(3)), scene.world_from_query, 0.05, is_measured
+    )
+    debug = debug_to_message(support_of(scene, SENT, scene.world_from_query), scale)
+    assert set(debug.source) == {source}
 
 
 def test_no_matches_make_an_empty_message() -> None:

@@ -26,7 +26,8 @@ def debug(noise_px: float = 1.0, wrong: int = 20) -> Debug:
     is_inlier = np.arange(200) >= wrong
     pixels[~is_inlier] = random.uniform(0, 480, (wrong, 2))
     shown = random.uniform(0, 480, (200, 2))
-    return Debug(pixels, x, is_inlier, np.where(is_inlier, 0.8, 30.0), np.arange(200) % 2, shown)
+    source = np.where(np.arange(200) < 150, "TRIANGULATED", "MEASURED_DEPTH")
+    return Debug(pixels, x, is_inlier, np.where(is_inlier, 0.8, 30.0), np.arange(200) % 2, shown, source)
 
 
 def diagnostics(names: tuple[str, ...] = ("a", "b")) -> Diagnostics:

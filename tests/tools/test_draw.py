@@ -99,7 +99,16 @@ class TestPage:
         answer = localized(arbitrary_unit=True, diagnostics=replace(diagnostics(), captured=True))
         words = " ".join(Page(answer_page("hall.jpg", answer, PHOTO, CAMERA, BOTH, [0, 0, -1])).words)
         assert str(answer) in words
-        for shown in ("hall.jpg: localized", "(180)", "4.00e-04", "id-1", "radial_tangential: k1 -0.1", "x, units"):
+        for shown in (
+            "hall.jpg: localized",
+            "(180)",
+            "130 triangulated",
+            "blue: by measured depth (50)",
+            "4.00e-04",
+            "id-1",
+            "radial_tangential: k1 -0.1",
+            "x, units",
+        ):
             assert shown in words
         assert str(AMBIGUOUS) in " ".join(Page(answer_page("", AMBIGUOUS, PHOTO, CAMERA)).words)
 

@@ -121,6 +121,14 @@ class ScaleStage(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     SCALE_STAGE_TRAJECTORY: _ClassVar[ScaleStage]
     SCALE_STAGE_NETWORK: _ClassVar[ScaleStage]
     SCALE_STAGE_DEPTH: _ClassVar[ScaleStage]
+
+class PointSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    POINT_SOURCE_UNSPECIFIED: _ClassVar[PointSource]
+    POINT_SOURCE_TRIANGULATED: _ClassVar[PointSource]
+    POINT_SOURCE_MEASURED_DEPTH: _ClassVar[PointSource]
+    POINT_SOURCE_KEPT_DEPTH: _ClassVar[PointSource]
+    POINT_SOURCE_NETWORK_DEPTH: _ClassVar[PointSource]
 AXES_UNSPECIFIED: Axes
 AXES_OPENCV: Axes
 AXES_ARKIT: Axes
@@ -195,6 +203,11 @@ SCALE_STAGE_TRIANGULATION: ScaleStage
 SCALE_STAGE_TRAJECTORY: ScaleStage
 SCALE_STAGE_NETWORK: ScaleStage
 SCALE_STAGE_DEPTH: ScaleStage
+POINT_SOURCE_UNSPECIFIED: PointSource
+POINT_SOURCE_TRIANGULATED: PointSource
+POINT_SOURCE_MEASURED_DEPTH: PointSource
+POINT_SOURCE_KEPT_DEPTH: PointSource
+POINT_SOURCE_NETWORK_DEPTH: PointSource
 
 class LocalizeRequest(_message.Message):
     __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "intrinsics_uncertainty", "mask", "depth")
@@ -655,7 +668,7 @@ class StageTiming(_message.Message):
     def __init__(self, stage: _Optional[str] = ..., duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ...) -> None: ...
 
 class Debug(_message.Message):
-    __slots__ = ("query_x_px", "query_y_px", "point_x_m", "point_y_m", "point_z_m", "is_inlier", "error_px", "reference", "reference_x_px", "reference_y_px")
+    __slots__ = ("query_x_px", "query_y_px", "point_x_m", "point_y_m", "point_z_m", "is_inlier", "error_px", "reference", "reference_x_px", "reference_y_px", "source")
     QUERY_X_PX_FIELD_NUMBER: _ClassVar[int]
     QUERY_Y_PX_FIELD_NUMBER: _ClassVar[int]
     POINT_X_M_FIELD_NUMBER: _ClassVar[int]
@@ -666,6 +679,7 @@ class Debug(_message.Message):
     REFERENCE_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_X_PX_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_Y_PX_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
     query_x_px: _containers.RepeatedScalarFieldContainer[float]
     query_y_px: _containers.RepeatedScalarFieldContainer[float]
     point_x_m: _containers.RepeatedScalarFieldContainer[float]
@@ -676,7 +690,8 @@ class Debug(_message.Message):
     reference: _containers.RepeatedScalarFieldContainer[int]
     reference_x_px: _containers.RepeatedScalarFieldContainer[float]
     reference_y_px: _containers.RepeatedScalarFieldContainer[float]
-    def __init__(self, query_x_px: _Optional[_Iterable[float]] = ..., query_y_px: _Optional[_Iterable[float]] = ..., point_x_m: _Optional[_Iterable[float]] = ..., point_y_m: _Optional[_Iterable[float]] = ..., point_z_m: _Optional[_Iterable[float]] = ..., is_inlier: _Optional[_Iterable[bool]] = ..., error_px: _Optional[_Iterable[float]] = ..., reference: _Optional[_Iterable[int]] = ..., reference_x_px: _Optional[_Iterable[float]] = ..., reference_y_px: _Optional[_Iterable[float]] = ...) -> None: ...
+    source: _containers.RepeatedScalarFieldContainer[PointSource]
+    def __init__(self, query_x_px: _Optional[_Iterable[float]] = ..., query_y_px: _Optional[_Iterable[float]] = ..., point_x_m: _Optional[_Iterable[float]] = ..., point_y_m: _Optional[_Iterable[float]] = ..., point_z_m: _Optional[_Iterable[float]] = ..., is_inlier: _Optional[_Iterable[bool]] = ..., error_px: _Optional[_Iterable[float]] = ..., reference: _Optional[_Iterable[int]] = ..., reference_x_px: _Optional[_Iterable[float]] = ..., reference_y_px: _Optional[_Iterable[float]] = ..., source: _Optional[_Iterable[_Union[PointSource, str]]] = ...) -> None: ...
 
 class LocalizeRigRequest(_message.Message):
     __slots__ = ("scene", "images", "options", "capture_time", "session_from_rig")

@@ -157,7 +157,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         is_wanted = request.options.include_debug or query.scene_key in self._watchers.by_scene
         if answer.support is None or not is_wanted:
             return None
-        return await asyncio.to_thread(debug_to_message, answer.support)
+        return await asyncio.to_thread(debug_to_message, answer.support, answer.scale)
 
     async def LocalizeRig(self, request: pb.LocalizeRigRequest, call: Call) -> pb.LocalizeRigResponse:
         """Implements LocalizationService.LocalizeRig."""

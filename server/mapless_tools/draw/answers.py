@@ -123,6 +123,8 @@ def _shaped(debug: Debug, reference_count: int) -> Debug:
     columns: dict[str, Any] = {}
     for name, column in vars(debug).items():
         shape = (count, *_ROWS.get(name, ()))
+        if name == "source" and not len(column):  # of an older server
+            shape = (0,)
         columns[name] = column.reshape(shape) if count == 0 and column.shape == (0,) else column
         if columns[name].shape != shape:
             raise ValueError(f"debug.{name} has the shape {column.shape}, not {shape}")

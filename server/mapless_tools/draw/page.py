@@ -7,12 +7,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mapless import Camera, LocalizationResult, Reference, Rejected
+from mapless.answers import POINT_SOURCES
 from mapless.diagnostics import Debug, Diagnostics
 from mapless.lenses import lens_model_of
 from mapless.names import reference_name
 from mapless_server.errors import InvalidArgument
 from mapless_tools.charts import figure_of, inline_svg, new_axes
-from mapless_tools.matches import MAX_GOOD, MAX_WRONG, Shot, axes_on, data_uri, draw_matches, rendered, side_by_side
+from mapless_tools.matches import (
+    MAX_GOOD,
+    MAX_WRONG,
+    SOURCE_COLOURS,
+    Shot,
+    axes_on,
+    data_uri,
+    draw_matches,
+    rendered,
+    side_by_side,
+    source_colours,
+)
 from mapless_tools.output_files import render
 from mapless_tools.plan import FOUND, OTHER, REFERENCE, Cameras, basis_from_above, down_of, draw_ellipse, draw_plan
 
@@ -105,12 +117,15 @@ def _photograph(answer: Answer, image: bytes, camera: Camera) -> Figure:
     if isinstance(answer, LocalizationResult):
         seen = camera.project(answer.world_from_camera.inverse().apply(debug.x_in_world))
         projected = shot.pixels_of(seen, camera)
-    factor = draw_matches(axes, shot.pixels_of(debug.query_px, camera), projected, good)
+    pixels = shot.pixels_of(debug.query_px, camera)
+    factor = draw_matches(axes, pixels, projected, good, colours=source_colours(debug))
     caption = f"{count}: dots agree with the pose ({good.sum()}), crosses do not ({(~good).sum()})."
     if projected is None:
         caption = f"{count}, no pose was accepted."
     elif factor > 1:
         caption += f" Lines lead to the projections of their points, those of dots drawn {factor} times as long."
+    if sources := [f"{_source(it)} ({count})" for it, count in debug.inliers_by_source().items()]:
+        caption += f" Dots are {', '.join(sources)}."
     return Figure(caption, data_uri(rendered(axes.figure)))
 
 
@@ -148,7 +163,8 @@ def _pairs(answer: Answer, image: bytes, camera: Camera, references: Mapping[str
             f"{reference.reference_id}: {use.inlier_count} inliers on points that it shows, {use.match_count} feature "
             f"matches; drawn are {drawn} of the {len(good)} matches that it shows best"
         )
-        figures.append(Figure(caption, data_uri(side_by_side(shot, other, *ends, good))))
+        colours = np.array(source_colours(debug))[rows].tolist()
+        figures.append(Figure(caption, data_uri(side_by_side(shot, other, *ends, good, colours=colours))))
     return figures
 
 
@@ -219,10 +235,26 @@ def _tables(answer: Answer) -> list[Table]:
     times = {**used.stage_s, "waiting": used.queue_s, "all": used.total_s}
     return [
         *tables,
+        Table("What gives points their distance", ("points", "matches", "inliers"), _sources(answer.debug)),
         Table("References", head, references),
         Table("Attempts", ("attempt", "features", "outcome", "time", "the answer's"), attempts),
         Table("Where the time went", ("stage", "ms"), [[stage, f"{1000 * it:.0f}"] for stage, it in times.items()]),
     ]
+
+
+def _sources(debug: Debug | None) -> list[list[str]]:
+    """Matches and inliers by the source of their points."""
+    if debug is None:
+        return []
+    return [
+        [_source(it), str((debug.source == it).sum()), str(inliers)]
+        for it, inliers in debug.inliers_by_source().items()
+    ]
+
+
+def _source(name: str) -> str:
+    """A source of points, with its colour."""
+    return f"{SOURCE_COLOURS[name][0]}: {POINT_SOURCES[name]}" if name in SOURCE_COLOURS else name
 
 
 def _hypotheses(answer: Rejected) -> list[list[str]]:

@@ -10,14 +10,18 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, normalize
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.method.bundle.estimate import PosedSupport, Support
-from mapless_server.method.features.views import View
+from mapless_server.method.features.views import DepthSource, PosedView, View
+from mapless_server.method.structure.model import MetricScale, ScaleStage
 
 MAX_MATCHES = 2000
 """About 100 KB of message, and more than can be seen in a picture."""
 
 
-def debug_to_message(support: Support) -> pb.Debug:
-    """Message of a support's matches; if there are too many, inliers are preferred and sampled evenly."""
+def debug_to_message(support: Support, scale: MetricScale | None = None) -> pb.Debug:
+    """Message of a support's matches, of an answer with this scale.
+
+    If there are too many, inliers are preferred and sampled evenly.
+    """
     matches = support.matches
     inlier, error_px = np.zeros(len(matches), bool), np.full(len(matches), np.nan)
     if isinstance(support, PosedSupport):
@@ -38,6 +42,7 @@ def debug_to_message(support: Support) -> pb.Debug:
         reference=reference.tolist(),
         reference_x_px=reference_px[:, 0].tolist(),
         reference_y_px=reference_px[:, 1].tolist(),
+        source=_sources(support, scale)[point].tolist(),
     )
 
 
@@ -59,6 +64,25 @@ def _thinned(rows: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     if len(rows) <= count:
         return rows
     return rows[np.linspace(0, len(rows) - 1, count).round().astype(np.intp)]
+
+
+def _sources(support: Support, scale: MetricScale | None) -> NDArray[np.int32]:
+    """The source (P,) of each point of the structure, of `pb.PointSource`."""
+    structure = support.structure
+    sources = np.full(len(structure.x_in_world), pb.POINT_SOURCE_TRIANGULATED, np.int32)
+    if scale is not None and scale.is_from_depth:
+        predicted = pb.POINT_SOURCE_KEPT_DEPTH if scale.stage is ScaleStage.DEPTH else pb.POINT_SOURCE_NETWORK_DEPTH
+        sources[:] = pb.POINT_SOURCE_MEASURED_DEPTH if scale.is_measured else predicted
+    elif (planes := structure.planes) is not None:
+        is_measured = np.array([_is_measured(it) for it in support.references])
+        by_depth = ~structure.triangulated & (planes.information > 0)
+        of_plane = np.where(is_measured[planes.view], pb.POINT_SOURCE_MEASURED_DEPTH, pb.POINT_SOURCE_KEPT_DEPTH)
+        sources[by_depth] = of_plane[by_depth]
+    return sources
+
+
+def _is_measured(reference: PosedView) -> bool:
+    return reference.depths is not None and reference.depths.source is DepthSource.MEASURED
 
 
 def _best_observations(support: Support, points: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array]:
