@@ -73,6 +73,25 @@ def test_the_nearer_of_two_surfaces_hides_the_other() -> None:
     assert columns.max() == pytest.approx(399 + 104, abs=1)
 
 
+@pytest.mark.parametrize("lens", [None, Fisheye(0.02, -0.01, 0.0, 0.0)])
+def test_depths_of_another_camera_are_moved_as_point_by_point(lens: Fisheye | None) -> None:
+    """In single precision a place may be rounded to the pixel beside, and so hide, or be hidden."""
+    pose = RigidTransform(rotation_from_vector([0.02, -0.03, 0.1]), np.array([0.05, -0.02, 0.01]))
+    random = np.random.default_rng(3)
+    depth = random.uniform(1.0, 3.0, (120, 160)).astype(np.float32)
+    depth[random.uniform(size=depth.shape) < 0.2] = np.nan
+    measured = MeasuredDepth(Camera(160, 120, 140.0, 150.0, 80.0, 60.0, lens), depth, NOISE, pose)
+    target = CAMERA.resized(160, 120)
+    expected = np.full((120, 160), np.inf)
+    for x in pose.apply(measured.points()):
+        column, row = np.rint(target.project(x)).astype(int)
+        if 0 <= column < 160 and 0 <= row < 120:
+            expected[row, column] = min(expected[row, column], x[2])
+    hit = np.isfinite(expected)
+    found = measured.seen_by(target).depth
+    assert (np.abs(found[hit] / expected[hit] - 1) < 1e-5).mean() > 0.998
+
+
 def test_there_is_no_depth_at_an_edge() -> None:
     depth = np.full((480, 640), 2.0, np.float32)
     depth[:, 320:] = 3.0

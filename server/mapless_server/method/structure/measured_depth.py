@@ -60,14 +60,32 @@ class MeasuredDepth:
         )
         width, height = (max(1, round(side * min(density, 1.0))) for side in (camera.width_px, camera.height_px))
         target = camera.resized(width, height)
-        points = self.camera_from_depth_camera.apply(self.points())
-        points = points[points[:, 2] > 0]
-        columns, rows = np.rint(target.project(points)).astype(np.intp).T
-        inside = (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
-        nearest = np.full(width * height, np.inf)
-        np.minimum.at(nearest, rows[inside] * width + columns[inside], points[inside, 2])
-        depth = np.where(np.isfinite(nearest), nearest, np.nan).reshape(height, width)
-        return MeasuredDepth(target, _filled(depth), self.noise)
+        pixels, depth = self._seen_pixels(target)
+        with np.errstate(invalid="ignore"):
+            inside = (depth > 0) & (pixels >= 0).all(axis=0) & (pixels[0] < width) & (pixels[1] < height)
+        columns, rows = pixels[:, inside]
+        nearest = np.full(width * height, np.inf, np.float32)
+        np.minimum.at(nearest, (rows * width + columns).astype(np.intp), depth[inside])
+        return MeasuredDepth(target, _filled(nearest.reshape(height, width)), self.noise)
+
+    def _seen_pixels(self, target: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Pixels (2, H, W) of a pinhole at the photograph's place that show the depths, rounded, and depths there.
+
+        A depth d at the homogeneous pixel p has its place in the other image at d M p + b. In single precision, whose
+        pixels are exact to a thousandth, all takes a third of the time.
+        """
+        assert self.camera_from_depth_camera is not None
+        pose, k = self.camera_from_depth_camera, target.matrix()
+        m = (k @ pose.rotation @ np.linalg.inv(self.camera.matrix())).astype(np.float32)
+        b = (k @ pose.translation).astype(np.float32)
+        height, width = self.depth.shape
+        column, row = np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)[:, None]
+        if self.camera.distortion is not None:
+            pixels = np.stack(np.meshgrid(column, row), axis=-1).reshape(-1, 2).astype(np.float64)
+            column, row = undistort_pixels(pixels, self.camera).T.reshape(2, height, width).astype(np.float32)
+        x, y, z = (self.depth * (m[i, 0] * column + (m[i, 1] * row + m[i, 2])) + b[i] for i in range(3))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.rint(np.stack([x, y]) / z), z
 
     def points(self) -> Array:
         """The points (P, 3) of the pixels with a depth, in the frame of the depth camera."""
@@ -114,10 +132,12 @@ def _without_edges(patches: Array, noise: DepthNoise) -> Array:
     return np.where(near_edge, np.nan, inverse[:, 2:-2, 2:-2])
 
 
-def _filled(depth: Array) -> NDArray[np.float32]:
-    """Fills single holes, between pixels that rounding moved apart, with the nearest depth around."""
-    inverse = np.nan_to_num(1 / depth)
+def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Fills single holes, between pixels that rounding moved apart, with the nearest depth around.
+
+    Holes are infinite, and NaN in the result.
+    """
+    inverse = 1 / depth
     closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     with np.errstate(divide="ignore"):
-        filled = np.where(closed > 0, 1 / closed, np.nan)
-    return np.where(np.isnan(depth), filled, depth).astype(np.float32)
+        return np.where(np.isfinite(depth), depth, np.where(closed > 0, 1 / closed, np.float32(np.nan)))
