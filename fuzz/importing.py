@@ -21,6 +21,7 @@ from support.layouts import truth
 from mapless.geometry import Camera
 from mapless.names import check_id
 from mapless_tools.dataset import SPLITS, Dataset
+from mapless_tools.ingest.depth_options import DepthOptions
 from mapless_tools.ingest.formats import ReadOptions, read_dataset, recognize
 from mapless_tools.ingest.formats.cameras import add_frame
 from mapless_tools.ingest.formats.collecting import Collector, check_camera
@@ -151,7 +152,7 @@ def _check_written(dataset: Dataset, folder: Path) -> None:
     name = frame.image_path.relative_to(folder).as_posix()
     (text,) = cameras_files([PosedImage(name, frame.camera, frame.world_from_camera)], "").values()
     (entry,) = json.loads(text)["frames"]
-    collector = Collector(folder)
+    collector = Collector(folder, DepthOptions())
     add_frame(collector, entry | {"image": name, "split": frame.split})
     (again,) = collector.frames
     assert again.camera == frame.camera, (again.camera, frame.camera)

@@ -34,9 +34,16 @@ _MAX_QUOTED = 1000
 Parsed = TypeVar("Parsed")
 
 
+DecodeDepth = Callable[[bytes], tuple[bytes, tuple[int, int]]]
+"""Float32 values and their size, as in `DepthImage`, of the bytes of a file; ValueError if these are damaged."""
+
+
 @dataclass(frozen=True, eq=False)
 class DepthFile:
-    """The depth of a photograph in files: its values, and perhaps their confidence; the rest is as in `DepthImage`."""
+    """The depth of a photograph in files: its values, and perhaps their confidence; the rest is as in `DepthImage`.
+
+    `decode` reads a file that is neither a PNG nor plain float32 values.
+    """
 
     path: Path
     unit_m: float
@@ -47,6 +54,7 @@ class DepthFile:
     min_confidence: int = 1
     noise: DepthNoise | None = None
     size: tuple[int, int] | None = None
+    decode: DecodeDepth | None = None
 
     def scaled(self, scale: float) -> DepthFile:
         """The same depth in a unit of length of which there are `scale` in the present one; noise stays in metres."""
@@ -56,12 +64,16 @@ class DepthFile:
         return replace(self, unit_m=scale * self.unit_m, camera_from_depth_camera=pose)
 
     def read(self) -> DepthImage:
-        """Reads the files; OSError."""
+        """Reads the files; OSError, or ValueError, which names the file, if its format is not as it should be."""
         confidence = b"" if self.confidence_path is None else self.confidence_path.read_bytes()
+        data, size = self.path.read_bytes(), self.size
+        if self.decode is not None:
+            with named(str(self.path)):
+                data, size = self.decode(data)
         return DepthImage(
-            self.path.read_bytes(),
+            data,
             self.unit_m,
-            self.size,
+            size,
             self.sensor,
             self.camera,
             self.camera_from_depth_camera,
@@ -101,7 +113,7 @@ class Frame:
         return extract_upright(extractor, pixels, self.camera, upright_deg, ignored=self.read_ignored())
 
     def read_depth(self) -> DepthImage | None:
-        """Its depth, None without one; OSError."""
+        """Its depth, None without one; OSError or ValueError as of `DepthFile.read`."""
         return None if self.depth is None else self.depth.read()
 
     def read_ignored(self) -> NDArray[np.bool_] | None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.dataset import Dataset, Frame
+from mapless_tools.ingest.formats.seven_scenes import CAMERA_FROM_DEPTH_CAMERA
 from mapless_tools.ingest.formats.writing import LAYOUTS, PosedImage
 from support.images import encode, textured
 
@@ -114,9 +115,10 @@ Shots = Sequence[tuple[NDArray[np.uint8], RigidTransform]]
 
 
 def write_seven_scenes(scene: Path, references: Shots, queries: Shots) -> Path:
-    """References are sequence 1, queries sequence 2."""
+    """References are sequence 1, queries sequence 2; poses are those of the depth camera."""
     for number, shots in enumerate((references, queries), 1):
-        for i, shot in enumerate(shots):
+        for i, (image, pose) in enumerate(shots):
+            shot = image, pose.compose(CAMERA_FROM_DEPTH_CAMERA)
             _write_posed(scene / f"seq-{number:02d}" / f"frame-{i:06d}", ".png", shot)
     (scene / "TrainSplit.txt").write_text("sequence1\n")
     (scene / "TestSplit.txt").write_text("sequence2\n\n")

@@ -12,6 +12,7 @@ from mapless_server.serve.assembly import image_limits
 from mapless_server.serve.signals import terminable
 from mapless_server.settings import load_settings
 from mapless_tools.connection import Connection, connected
+from mapless_tools.ingest.depth_options import DepthOptions
 from mapless_tools.ingest.formats import ReadOptions, read_dataset
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.output_files import check_writable, write_json
@@ -144,7 +145,8 @@ def _read_scene(
 ) -> SceneWork:
     """Reads, splits and checks a scene; UsageError if that is not possible, or images cannot be used."""
     with usage_errors():
-        dataset = read_dataset(place.path, place.layout, ReadOptions(ground_truth=ground_truth))
+        depths = DepthOptions(no_depth=place.benchmark is not None)  # the paper's figures are without
+        dataset = read_dataset(place.path, place.layout, ReadOptions(ground_truth=ground_truth, depths=depths))
     if not dataset.metric:
         raise UsageError(f"{place.name}: its unit of length is arbitrary, the paper's figures are centimetres")
     faults = [refusal for refusal in dataset.refused if not refusal.reason.startswith(NO_POSE)]

@@ -13,6 +13,7 @@ FORMATS = {
     "cambridge": "cambridge",
     "nerf": "nerf",
     "tum": "tum",
+    "icl": "icl_nuim",
     "arkit": "arkit",
     "kapture": "kapture",
     "rosbag": "rosbag",

@@ -18,6 +18,7 @@ from mapless_tools.bags.options import BagOptions
 from mapless_tools.connection import Connection, Scene, with_flags
 
 from . import FORMATS
+from .depth_options import DepthOptions
 
 if TYPE_CHECKING:
     from mapless_server.settings import Settings
@@ -117,6 +118,7 @@ def import_command(
     data_dir: DataDir = None,
     *,
     bag: BagOptions,
+    depths: DepthOptions,
     connection: Connection,
 ) -> None:
     """Store the posed photographs of a folder, or keyframes of a recording, as references of a scene.
@@ -137,6 +139,7 @@ def import_command(
             intrinsics=_intrinsics(intrinsics),
             bag=bag,
             keyframes=KeyframeOptions(keyframe_distance, keyframe_angle),
+            depths=depths,
         )
         options = ImportOptions(
             format=format,

@@ -6,7 +6,9 @@ photograph.
 
 Polycam (raw data): keyframes/images/*.jpg and keyframes/cameras/*.json of the same names, or, where the app has
 improved the poses, keyframes/corrected_images and keyframes/corrected_cameras, which are then taken. The .json has
-`t_00` to `t_23` (rows of world_from_camera), `fx`, `fy`, `cx`, `cy`, `width`, `height`.
+`t_00` to `t_23` (rows of world_from_camera), `fx`, `fy`, `cx`, `cy`, `width`, `height`. keyframes/depth/*.png of the
+same names has the depth of a phone with LiDAR, 192x256 values in millimetres of the same camera, and
+keyframes/confidence/*.png how certain they are: 0, 127 or 255.
 
 Camera axes are OpenGL's, x along the longer side of the sensor: poses and intrinsics belong to the stored landscape
 raster whichever way the phone was held. Apple counts principal points from the corner of the top-left pixel.
@@ -17,14 +19,17 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mapless.depth import DepthSensor
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_tools.dataset import Dataset, finite_numbers, named, read_json
+from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named, read_json
 
 from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of
 
 _POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 _IMAGE_ENDS = (".jpg", ".jpeg", ".png")
 _CASES = tuple(written for end in _IMAGE_ENDS for written in (end, end.upper()))
+POLYCAM_MIN_CONFIDENCE = 127
+"""The middle of three values: 0, 127, 255."""
 _SCANNER_FRAME = re.compile(r"frame_\d+")
 
 
@@ -35,7 +40,7 @@ def fits(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> Dataset:
     """Reads the folder; see `read_dataset`."""
-    collector = Collector(path)
+    collector = Collector(path, options.depths)
     folders = _polycam(path)
     if folders is not None:
         images, cameras = (path / "keyframes" / name for name in folders)
@@ -51,7 +56,8 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         relative = image.relative_to(path).as_posix()
         with collector.attempt(relative):
             camera, pose = _frame(file, size_of(image), parse)
-            collector.add(relative, camera, from_opengl(pose), name=image.stem)
+            depth = None if folders is None else _polycam_depth(collector, image)
+            collector.add(relative, camera, from_opengl(pose), name=image.stem, depth=depth)
     return collector.dataset(path.resolve().name, "arkit", metric=True, source="ARKit", ground_truth="device tracking")
 
 
@@ -73,6 +79,17 @@ def _frame(file: Path, size: tuple[int, int], parse: Parse) -> tuple[Camera, Rig
 def _polycam(path: Path) -> tuple[str, str] | None:
     keyframes = path / "keyframes"
     return next((pair for pair in _POLYCAM if all((keyframes / name).is_dir() for name in pair)), None)
+
+
+def _polycam_depth(collector: Collector, image: Path) -> DepthFile | None:
+    depth, confidence = (Path(f"keyframes/{folder}/{image.stem}.png") for folder in ("depth", "confidence"))
+    if not (collector.folder / depth).is_file():
+        return None
+    certain = confidence if (collector.folder / confidence).is_file() else None
+    file = DepthFile(
+        depth, 0.001, DepthSensor.PHONE_LIDAR, confidence_path=certain, min_confidence=POLYCAM_MIN_CONFIDENCE
+    )
+    return collector.depth(file, size_of(image))
 
 
 def _images(folder: Path) -> list[Path]:

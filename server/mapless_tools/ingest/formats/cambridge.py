@@ -27,7 +27,7 @@ def fits(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> Dataset:
     """Reads the folder; see `read_dataset`."""
-    collector = Collector(path)
+    collector = Collector(path, options.depths)
     lenses = _lenses(path / RECONSTRUCTION) if options.intrinsics is None else {}
     lines = [(words[0], words[1:], split) for split, file in SPLIT_FILES.items() for words in _pose_lines(path / file)]
     for image, words, split in sorted(lines, key=lambda line: natural_order(line[0])):

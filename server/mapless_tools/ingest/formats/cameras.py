@@ -44,7 +44,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     metric = content.get("metric", True)
     if not isinstance(metric, bool):
         raise ValueError(f"{file}: metric must be true or false")
-    collector = Collector(path)
+    collector = Collector(path, options.depths)
     names = _names(path, content["frames"])
     for index, entry in enumerate(content["frames"]):
         image = entry.get("image", "?") if isinstance(entry, dict) else "?"
@@ -110,6 +110,6 @@ def add_frame(
     with named("provenance"):
         provenance = provenance_from_json(entry.get("provenance"))
     file = collector.image(image)
-    depth = depth_of_frame(collector.folder, entry, beside)
+    depth = None if collector.depths.no_depth else depth_of_frame(collector.folder, entry, beside)
     name = names.get(file, file.stem)
     collector.add(image, camera, pose, entry.get("split", ""), name, entry.get("mask"), provenance, depth)

@@ -13,14 +13,15 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from mapless.cameras import MAX_SIDE_PX
-from mapless.depth import DepthSensor
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
 from mapless.provenance import GIVEN_POSE, Provenance
 from mapless.text_files import numbered_lines
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ANY_SIZE, ImageLimits, check_depth, image_size
+from mapless_server.images import ANY_SIZE, ImageLimits, decode_depth, image_size
 from mapless_tools.bags.options import BagOptions
 from mapless_tools.dataset import Dataset, DepthFile, Frame, Refusal, image_file, legal_id, named, path_in, printable
+
+from ..depth_options import DepthOptions
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class ReadOptions:
             and `12scenes`.
         intrinsics: for layouts without them (`7scenes`, `tum`, recordings); None for the layout's usual ones.
         bag, keyframes: topics, frames and images of a recording that are used; only for `rosbag`.
+        depths: what is used of the depths of photographs.
     """
 
     images: Path | None = None
@@ -80,6 +82,7 @@ class ReadOptions:
     intrinsics: Intrinsics | None = None
     bag: BagOptions = field(default_factory=BagOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
+    depths: DepthOptions = field(default_factory=DepthOptions)
 
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -90,9 +93,10 @@ _HEAD_BYTES = 2**16
 class Collector:
     """Frames of a layout as they are read, and those that were refused."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, depths: DepthOptions) -> None:
         """Paths of images are relative to `folder`."""
         self.folder = folder
+        self.depths = depths
         self.frames: list[Frame] = []
         self.refused: list[Refusal] = []
         self.notes: list[str] = []
@@ -142,22 +146,27 @@ class Collector:
         # The folders belong to the id: sequences count their frames from 0, each of them.
         parts = PurePosixPath(name or file.relative_to(self.folder).with_suffix("")).parts
         identifier = legal_id("_".join(parts), self._ids)
-        frame = Frame(identifier, file, camera, world_from_camera, split, self._mask(mask), provenance, depth)
+        chosen = self.depths.of(depth)
+        frame = Frame(identifier, file, camera, world_from_camera, split, self._mask(mask), provenance, chosen)
         self.frames.append(frame)
         self._ids.add(identifier)
         self._images.add(file)
 
-    def depth(
-        self, path: object, photo: tuple[int, int], unit_m: float, sensor: DepthSensor = DepthSensor.UNKNOWN
-    ) -> DepthFile | None:
-        """The depth of a frame of this size, (width, height) pixels; None, and a note, if it cannot be used."""
-        try:
-            depth = DepthFile(path_in(self.folder, path), unit_m, sensor)
-            check_depth(depth.read(), photo, ImageLimits())
-        except (InvalidArgument, OSError, ValueError) as error:
-            self.leave_out_depth(str(path), error)
+    def depth(self, depth: DepthFile, photo: tuple[int, int]) -> DepthFile | None:
+        """The depth of a frame of this size, (width, height) pixels; None, and a note, if it cannot be used.
+
+        Its paths are from the folder, as the layout has them.
+        """
+        if self.depths.no_depth:
             return None
-        return depth
+        try:
+            confidence = depth.confidence_path and path_in(self.folder, str(depth.confidence_path))
+            found = replace(depth, path=path_in(self.folder, str(depth.path)), confidence_path=confidence)
+            decode_depth(found.read(), photo, ImageLimits())
+        except (InvalidArgument, OSError, ValueError) as error:
+            self.leave_out_depth(str(depth.path), error)
+            return None
+        return found
 
     def _mask(self, mask: str | None) -> Path | None:
         if mask is None:
@@ -175,6 +184,8 @@ class Collector:
             first = f"; the first, {self.refused[0].frame}: {self.refused[0].reason}" if self.refused else ""
             raise ValueError(f"{self.folder}: none of {len(self.refused)} frames can be used{first}")
         notes = list(self.notes)
+        if with_depth := sum(frame.depth is not None for frame in self.frames):
+            notes.append(f"depth: {with_depth} of {len(self.frames)} photographs have one")
         if self._unused_depths:
             notes.append(
                 printable(f"{len(self._unused_depths)} depths are left out; the first, {self._unused_depths[0]}")

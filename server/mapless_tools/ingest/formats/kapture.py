@@ -47,7 +47,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         )
     tables = path if is_capture else path / "sensors"
     records = tables / ("images.txt" if is_capture else "records_camera.txt")
-    collector = Collector(tables / ("raw_data" if is_capture else "records_data"))
+    collector = Collector(tables / ("raw_data" if is_capture else "records_data"), options.depths)
     trajectories = tables / "trajectories.txt"
     aligned = path / "proc" / "alignment_trajectories.txt"
     if is_capture and aligned.is_file():

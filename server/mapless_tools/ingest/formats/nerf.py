@@ -36,7 +36,7 @@ def fits(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> Dataset:
     """Reads the folder; see `read_dataset`."""
-    collector = Collector(path)
+    collector = Collector(path, options.depths)
     names = [FILE_NAME] if (path / FILE_NAME).is_file() else [n for n in SPLIT_FILES if (path / n).is_file()]
     if not names:
         raise ValueError(f"{path} holds no {FILE_NAME}")
@@ -78,7 +78,9 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
 
 def _depth(collector: Collector, frame: Mapping[str, Any], camera: Camera) -> DepthFile | None:
     path = frame.get("depth_file_path")
-    return None if path is None else collector.depth(path, (camera.width_px, camera.height_px), DEPTH_UNIT)
+    if path is None:
+        return None
+    return collector.depth(DepthFile(Path(str(path)), DEPTH_UNIT), (camera.width_px, camera.height_px))
 
 
 def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:

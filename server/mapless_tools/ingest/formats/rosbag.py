@@ -46,7 +46,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         poses = open_poses(images, options.bag)
         folder = TemporaryDirectory(prefix="mapless-keyframes-")
         atexit.register(folder.cleanup)
-        collector = Collector(Path(folder.name))
+        collector = Collector(Path(folder.name), options.depths)
         if images.infos is None and options.intrinsics is None:
             raise ValueError(f"{path} has no CameraInfo for the images of {images.topic}; give --intrinsics")
         found, unposed, is_undistorted = 0, _Unposed(collector), False

@@ -43,16 +43,16 @@ def fits(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> Dataset:
     """Reads the folder; see `read_dataset`."""
-    collector = Collector(path)
+    collector = Collector(path, options.depths)
     lens = _lens(path) if options.intrinsics is None else None
     file = path / "groundtruth.txt"
-    rows = [_row(file, number, words) for number, words in _lines(file)]
+    rows = [pose_row(file, number, words) for number, words in numbered_words(file)]
     try:
         trajectory = Trajectory(rows, MAX_GAP_S)
     except ValueError as error:
         raise ValueError(f"{file} {error}") from error
     depths = _Depths(collector)
-    for number, words in _lines(path / "rgb.txt"):
+    for number, words in numbered_words(path / "rgb.txt"):
         with collector.attempt(f"rgb.txt:{number} ({words[-1]})"):
             if len(words) != 2:
                 raise ValueError(f"expected a time and a path, found {len(words)} words")
@@ -77,7 +77,7 @@ class _Depths:
         self._collector = collector
         self._times_s: list[float] = []
         self._paths: list[str] = []
-        for number, words in _lines(file) if file.is_file() else []:
+        for number, words in numbered_words(file) if file.is_file() else []:
             self._add(f"{file.name}:{number}", words)
 
     def _add(self, line: str, words: list[str]) -> None:
@@ -96,7 +96,8 @@ class _Depths:
         nearest = int(np.argmin(np.abs(np.array(self._times_s) - time_s)))
         if abs(self._times_s[nearest] - time_s) > MAX_GAP_S:
             return None
-        return self._collector.depth(self._paths[nearest], photo, DEPTH_UNIT_M, DepthSensor.STRUCTURED_LIGHT)
+        depth = DepthFile(Path(self._paths[nearest]), DEPTH_UNIT_M, DepthSensor.STRUCTURED_LIGHT)
+        return self._collector.depth(depth, photo)
 
 
 def _lens(path: Path) -> Camera:
@@ -110,11 +111,13 @@ def _lens(path: Path) -> Camera:
     return Camera(*_SIZE, *k, RadialTangential(*distortion) if distortion else None)
 
 
-def _lines(file: Path) -> list[tuple[int, list[str]]]:
+def numbered_words(file: Path) -> list[tuple[int, list[str]]]:
+    """Words of the lines of a table, with their numbers."""
     return [(number, line.split()) for number, line in filled_lines(file)]
 
 
-def _row(file: Path, number: int, words: list[str]) -> Array:
+def pose_row(file: Path, number: int, words: list[str]) -> Array:
+    """A time, position and quaternion x y z w; ValueError names the line if it is none."""
     with named(f"{file}:{number}"):
         row = finite_numbers(words, "time, position and quaternion", (8,))
         if not abs(np.linalg.norm(row[4:]) - 1) < 1e-2:

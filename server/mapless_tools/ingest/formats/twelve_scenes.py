@@ -3,12 +3,22 @@
 `split.txt` has a line "sequence0 [frames=357]  [start=0 ; end=356]" for each sequence; the first is the queries', the
 rest the references'. `info.txt` has lines "key = value", among them m_colorWidth, m_colorHeight and
 m_calibrationColorIntrinsic (4x4, row by row). The pose is a 4x4 world_from_camera, not finite where tracking was lost.
+
+frame-000000.depth.png has millimetres, 0 where there is none, of the depth camera: m_depthWidth, m_depthHeight,
+m_calibrationDepthIntrinsic, and m_calibrationDepthExtrinsic, which is camera_from_depth_camera, or the inverse of
+m_calibrationColorExtrinsic if that is the identity: VoxelHashing, which wrote these files, calls an extrinsic "the
+mapping to the other sensor".
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
-from mapless_tools.dataset import Dataset, finite_numbers, named
+import numpy as np
+
+from mapless.depth import DepthSensor
+from mapless.geometry import Array, RigidTransform
+from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named
 
 from .collecting import Collector, Intrinsics, ReadOptions, check_camera, filled_lines, size_of
 from .seven_scenes import GROUND_TRUTH, find_ground_truth, read_pose
@@ -24,8 +34,10 @@ def fits(path: Path) -> bool:
 
 def read(path: Path, options: ReadOptions) -> Dataset:
     """Reads the folder; see `read_dataset`."""
-    collector = Collector(path)
-    size, found = _intrinsics(path / "info.txt")
+    collector = Collector(path, options.depths)
+    info = _Info(path / "info.txt")
+    size, found = info.size("color"), _given(info.matrix("ColorIntrinsic"))
+    depth = _depth_camera(collector, info)
     queries = _queries(path / "split.txt")
     scene = "_".join(path.resolve().parts[-2:])
     truth = find_ground_truth(options.ground_truth, scene) if options.ground_truth else None
@@ -45,23 +57,69 @@ def read(path: Path, options: ReadOptions) -> Dataset:
             if size_of(image) != size:
                 camera = camera.resized(*size_of(image))
             split = "test" if int(number[1]) in queries else "train"
-            collector.add(relative, camera, pose, split if queries else "", image.name.removesuffix(_IMAGE_END))
+            name = image.name.removesuffix(_IMAGE_END)
+            found_depth = _depth(collector, f"data/{name}.depth.png", depth, (camera.width_px, camera.height_px))
+            collector.add(relative, camera, pose, split if queries else "", name, depth=found_depth)
     ground_truth = GROUND_TRUTH if truth is not None else "VoxelHashing (original)"
     return collector.dataset(scene, "12scenes", metric=True, source="12-Scenes", ground_truth=ground_truth)
 
 
-def _intrinsics(file: Path) -> tuple[tuple[int, int], Intrinsics]:
-    lines = (line.partition("=") for _, line in filled_lines(file))
-    values = {key.strip(): value for key, _, value in lines}
-    fields = ("m_colorWidth", "m_colorHeight", "m_calibrationColorIntrinsic")
-    for field in fields:
-        if field not in values:
-            raise ValueError(f"{file}: {field} is missing")
-    width, height, matrix = (values[field].split() for field in fields)
-    with named(str(file)):
-        k = finite_numbers(matrix, fields[2], (16,))
-        size = (int(finite_numbers(width, fields[0], (1,))[0]), int(finite_numbers(height, fields[1], (1,))[0]))
-        return size, Intrinsics(*k[[0, 5, 2, 6]].tolist())
+class _Info:
+    """The fields of info.txt; ValueError names one that is missing or wrong."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        lines = (line.partition("=") for _, line in filled_lines(file))
+        self._values = {key.strip(): value.split() for key, _, value in lines}
+
+    def matrix(self, name: str) -> Array:
+        """A calibration, (4, 4)."""
+        field = f"m_calibration{name}"
+        with named(str(self.file)):
+            return finite_numbers(self._words(field), field, (16,)).reshape(4, 4)
+
+    def pose(self, name: str) -> RigidTransform:
+        """A calibration that is a motion."""
+        matrix = self.matrix(name)
+        with named(f"{self.file}: m_calibration{name}"):
+            return RigidTransform.from_matrix(matrix)
+
+    def size(self, name: str) -> tuple[int, int]:
+        """Width and height of images, pixels."""
+        fields = [f"m_{name}{side}" for side in ("Width", "Height")]
+        with named(str(self.file)):
+            width, height = (int(finite_numbers(self._words(it), it, (1,))[0]) for it in fields)
+        return width, height
+
+    def _words(self, field: str) -> list[str]:
+        if field not in self._values:
+            raise ValueError(f"{field} is missing")
+        return self._values[field]
+
+
+def _given(k: Array) -> Intrinsics:
+    return Intrinsics(*k[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
+
+
+def _depth_camera(collector: Collector, info: _Info) -> DepthFile | None:
+    """All that the depths of a room have in common; None, and a note, if info.txt does not have their camera."""
+    if collector.depths.no_depth or next((collector.folder / "data").glob("*.depth.png"), None) is None:
+        return None
+    try:
+        camera = _given(info.matrix("DepthIntrinsic")).camera(*info.size("depth"))
+        pose, inverse = info.pose("DepthExtrinsic"), info.pose("ColorExtrinsic")
+    except ValueError as error:
+        collector.leave_out_depth("all", error)
+        return None
+    if np.array_equal(pose.matrix(), np.eye(4)):
+        pose = inverse.inverse()
+    return DepthFile(Path(), 0.001, DepthSensor.STRUCTURED_LIGHT, camera, pose)
+
+
+def _depth(collector: Collector, path: str, of_room: DepthFile | None, size: tuple[int, int]) -> DepthFile | None:
+    if of_room is None or not (collector.folder / path).is_file():
+        return None
+    return collector.depth(replace(of_room, path=Path(path)), size)
 
 
 def _queries(file: Path) -> range:

@@ -124,7 +124,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         raise ValueError(f"{path} holds several COLMAP models: {', '.join(map(str, folders))}; name one")
     model = read_model(folders[0])
     images = _images_folder(path, folders[0], model, options.images)
-    collector = Collector(images)
+    collector = Collector(images, options.depths)
     queries = folders[0] / "list_test.txt"  # hloc's name
     lines = text_lines(queries) if queries.is_file() else ()
     tests = {line.strip() for _, line in lines} - {""}  # one a line: COLMAP's names may have spaces
