@@ -85,7 +85,7 @@ def _geo_pose(message: pb.GeoPose, path: str) -> GeoPose:
     return GeoPose(position.lat, position.lon, position.h, Quaternion(q.x, q.y, q.z, q.w))
 
 
-def _debug(message: pb.Debug, path: str) -> Debug:
+def _debug(message: Any, path: str) -> Debug:
     def columns(*fields: str) -> Array:
         return np.stack([np.array(getattr(message, field), float) for field in fields], axis=1)
 
