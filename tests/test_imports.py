@@ -32,6 +32,7 @@ LADDER = (
     "method",
     "networks",
     "images",
+    "kernels",
     "scheduling",
 )
 """The rooms of mapless_server, the highest first; each may import those after it."""

@@ -7,6 +7,7 @@ photographs, with 95 % intervals by bootstrap over these.
 """
 
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -81,6 +82,8 @@ def _server(commit: str) -> Iterator[ChildServer]:
             if added.returncode:
                 raise UsageError(f"git has no commit {commit!r} here")
             stack.callback(subprocess.run, ["git", "worktree", "remove", "--force", str(tree)], check=False)
+            if (tree / "setup.py").exists():
+                subprocess.run([sys.executable, "setup.py", "--quiet", "build_ext", "--inplace"], cwd=tree, check=True)
         environment["PYTHONPATH"] = f"{tree / 'client'}:{tree / 'server'}"
         with child_server(Path(folder) / "data", environment=environment) as server:
             yield server

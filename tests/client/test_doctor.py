@@ -22,7 +22,7 @@ from mapless import Client
 from mapless.cli import doctor
 from mapless_server.security import create_token
 
-CHECKS = ["address", "protocol", "services", "token", "clock", "version", "limits", "matching", "query"]
+CHECKS = ["address", "protocol", "services", "token", "clock", "version", "limits", "query"]
 OURS = authority()
 
 

@@ -64,7 +64,7 @@ print(google.protobuf.__version__, grpc.__version__, np.__version__)
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The installed package, built outside the source tree."""
     source, built = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     for name in ("client", "server", "deploy/ray"):
         shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))

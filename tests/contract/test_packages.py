@@ -14,7 +14,7 @@ from support.users import registry_environment
 from support.waiting import LIMIT_S
 
 ROOT = Path(__file__).parents[2]
-SOURCES = ("client", "server", "deploy/ray/mapless_ray", "pyproject.toml", "README.md", "LICENSE")
+SOURCES = ("client", "server", "deploy/ray/mapless_ray", "pyproject.toml", "setup.py", "README.md", "LICENSE")
 BUILD_LIMIT_S = 170.0
 UV = (sys.executable, ROOT / ".ci" / "uv.py")
 """uv, with the package sources of pip."""

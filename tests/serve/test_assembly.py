@@ -7,7 +7,6 @@ import pytest
 from support.programs import printed
 
 from mapless_server.method.features.extractors import make_extractor
-from mapless_server.method.features.matching import Arithmetic, fastest_arithmetic
 from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsMissing
@@ -73,8 +72,7 @@ def test_auto_leaves_out_what_is_missing_and_logs_it(
     with caplog.at_level(logging.INFO):
         (tier,) = make_tiers(settings(tmp_path, features="auto"))
     assert tier.extractor.name.startswith("sift")
-    arithmetic, record = caplog.records
-    assert arithmetic.getMessage() == "descriptors are multiplied as float32"
+    (record,) = caplog.records
     assert expected in record.getMessage()
     assert "\n" not in record.getMessage()
     assert record.getMessage().startswith(f"features auto: sift; with {names} more ")
@@ -95,9 +93,7 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
     assert (tier.any_roll, any_roll.any_roll) == (False, True)
     assert (tier.max_pixels, any_roll.max_pixels) == (None, ANY_ROLL_PIXELS)
     assert tier.extractor.name.startswith("edgepoint2-l64-")
-    chosen, record = caplog.records
-    assert chosen.getMessage() == f"descriptors are multiplied as {fastest_arithmetic().value}"
-    assert tier.pipeline.matcher.pairs.arithmetic is fastest_arithmetic()
+    (record,) = caplog.records
     assert record.getMessage().startswith("features auto: edgepoint2-l64 and sift; with aliked and aliked-")
     assert record.getMessage().endswith("run `mapless-server weights fetch aliked aliked-lightglue`")
 
@@ -142,7 +138,7 @@ def test_light_glue_matches_alone_on_gpus_only(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(assembly, "find_weights", find)
     for device in ("cpu", "cuda"):
-        assembly._make_matcher("aliked", settings(tmp_path), device, Arithmetic.FLOAT32).close()
+        assembly._make_matcher("aliked", settings(tmp_path), device).close()
         assert looked_for == [] if device == "cpu" else ["aliked-lightglue"]
 
 

@@ -35,7 +35,6 @@ least."""
 _MAX_ERROR = 0.05
 """Largest error of a reference's photograph, matched with itself, from its stored pose; metres or units."""
 _TIME_KEY, _CONNECTIONS_KEY = "x-mapless-time", "x-mapless-connections"
-_ARITHMETIC_KEY = "x-mapless-arithmetic"
 _FEW_CONNECTIONS = 4096
 
 
@@ -238,14 +237,6 @@ def _check_limits(session: _Session) -> _Result:
     return NOTE, f"the server accepts {text} connections at a time: as many idle ones keep others out", advice
 
 
-def _check_matching(session: _Session) -> _Result:
-    """Reads how the server multiplies descriptors, which it has chosen for its features and processor."""
-    arithmetic = session.trailers.get(_ARITHMETIC_KEY, "")
-    if not arithmetic:
-        return NOTE, "the server does not say how it multiplies descriptors", ""
-    return OK, f"descriptors are multiplied as {arithmetic}", ""
-
-
 def _check_query(session: _Session) -> _Result:
     """Localizes a reference's photograph in its own scene."""
     client = session.client
@@ -279,7 +270,6 @@ _CHECKS: dict[str, tuple[Callable[[_Session], _Result], bool]] = {
     "clock": (_check_clock, False),
     "version": (_check_version, False),
     "limits": (_check_limits, False),
-    "matching": (_check_matching, False),
     "query": (_check_query, False),
 }
 """The checks in their order, and whether those after it need it."""

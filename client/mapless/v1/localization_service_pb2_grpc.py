@@ -40,8 +40,7 @@ class LocalizationServiceStub(object):
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
-    server's clock, `x-mapless-version`, its version, `x-mapless-connections`, the number of connections that it can hold,
-    and `x-mapless-arithmetic`, "float32" or "int8", how it multiplies descriptors of int8.
+    server's clock, `x-mapless-version`, its version, and `x-mapless-connections`, the number of connections that it can hold.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
     that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
@@ -96,8 +95,7 @@ class LocalizationServiceServicer(object):
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
-    server's clock, `x-mapless-version`, its version, `x-mapless-connections`, the number of connections that it can hold,
-    and `x-mapless-arithmetic`, "float32" or "int8", how it multiplies descriptors of int8.
+    server's clock, `x-mapless-version`, its version, and `x-mapless-connections`, the number of connections that it can hold.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
     that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without
@@ -234,8 +232,7 @@ class LocalizationService(object):
     in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
 
     Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
-    server's clock, `x-mapless-version`, its version, `x-mapless-connections`, the number of connections that it can hold,
-    and `x-mapless-arithmetic`, "float32" or "int8", how it multiplies descriptors of int8.
+    server's clock, `x-mapless-version`, its version, and `x-mapless-connections`, the number of connections that it can hold.
 
     Every error is a google.rpc.Status with one ErrorInfo (domain "mapless"), a RequestInfo, for INVALID_ARGUMENT a BadRequest
     that names the field, and for NOT_FOUND and ALREADY_EXISTS a ResourceInfo. A message over the server's limit (32 MiB unless configured otherwise) is RESOURCE_EXHAUSTED, without

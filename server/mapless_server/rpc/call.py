@@ -15,7 +15,6 @@ from .descriptors import most_connections
 from .sending import REQUEST_ID_KEY
 
 TIME_KEY, VERSION_KEY, CONNECTIONS_KEY = "x-mapless-time", "x-mapless-version", "x-mapless-connections"
-ARITHMETIC_KEY = "x-mapless-arithmetic"
 
 
 @dataclass(frozen=True)

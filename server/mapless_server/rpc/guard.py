@@ -106,8 +106,6 @@ class CallGuard:
         self._check_admission = check_admission
         self._observer = observer
         self._tracer = tracer
-        self.trailers: tuple[tuple[str, str], ...] = ()
-        """Trailers of successful answers, beside `Call.trailers`."""
         self._active = 0
         self._idle = asyncio.Event()
         self._idle.set()
@@ -135,7 +133,7 @@ class CallGuard:
                     self._check_admission(method, call.flow)
                     with self._places.taken(call.principal.holder):
                         response = await reply(handler, method, call, context)
-                    context.set_trailing_metadata((*call.trailers, *self.trailers))
+                    context.set_trailing_metadata(call.trailers)
                     result.code = "OK"
                     return response
                 except RequestError as error:

@@ -161,8 +161,8 @@ class SceneExplainer:
 
     def _free_matches(self, first: PosedView, second: PosedView) -> Matches:
         """Matches of what is not fixed to a camera, that one fundamental matrix explains; the poses take no part."""
-        ratio, arithmetic = self._matcher.options.distinct_ratio, self._matcher.pairs.arithmetic
-        matches = mutual_matches(first.view.features, second.view.features, ratio, True, arithmetic)
+        ratio = self._matcher.options.distinct_ratio
+        matches = mutual_matches(first.view.features, second.view.features, ratio, True)
         fixed = stationary_matches(first, second, matches, self._matcher.pairs.stationary)
         return consistent(first.view, second.view, matches[~fixed])
 

@@ -19,7 +19,6 @@ from mapless_server.images import ImageLimits
 from mapless_server.method.coarse import Reconstructor
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import FeatureExtractor, make_extractor
-from mapless_server.method.features.matching import Arithmetic, fastest_arithmetic
 from mapless_server.method.pairs.correspond import Matcher, make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.method.pipeline import Pipeline
@@ -177,7 +176,7 @@ def engine_over(store: Store, tiers: Sequence[Tier], options: EngineOptions, par
             Retrieval(own, tier.extractor, SceneIndexes(store, library, own, tier.extractor, capacity_bytes))
         )
     matcher = tiers[0].pipeline.matcher
-    pairs = PairMatches(matcher.options.reference_ratio, CACHED_AUDIT_PAIRS, matcher.pairs.arithmetic)
+    pairs = PairMatches(matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
     # References that are rolled against one another agree only by what matches at any roll.
     comparing = any_roll[0] if any_roll else tiers[0]
     agreements = SceneAgreements(store, indexes, library, comparing.extractor, comparing.pipeline.matcher, observed)
@@ -250,13 +249,11 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
     missing = _Missing()
     extractors = _make_extractors(settings, device, missing)
     first, cores = next(iter(extractors)), available_cores()
-    arithmetic = Arithmetic.FLOAT32 if [*extractors] == [WITHOUT_WEIGHTS] else fastest_arithmetic()
-    log.info("descriptors are multiplied as %s", arithmetic.value)
     matchers = {
         # A stronger tier on a CPU has LightGlue, a third of a second per pair.
-        name: make_matcher(name, cores, _find_light_glue(name, settings, missing), arithmetic=arithmetic)
+        name: make_matcher(name, cores, _find_light_glue(name, settings, missing))
         if device == "cpu" and name != first
-        else _make_matcher(name, settings, device, arithmetic)
+        else _make_matcher(name, settings, device)
         for name in extractors
     }
     _log_features(settings, extractors, missing)
@@ -386,16 +383,16 @@ def _make_extractor(name: str, settings: Settings, device: str) -> FeatureExtrac
     return make_extractor(name, find_weights(name, settings.weights_dir), device)
 
 
-def _make_matcher(name: str, settings: Settings, device: str, arithmetic: Arithmetic) -> Matcher:
+def _make_matcher(name: str, settings: Settings, device: str) -> Matcher:
     """Makes a matcher: nearest neighbours, or LightGlue on a GPU if its weights are present."""
     network = _light_glue_of(name)
     if device != "cpu" and network is not None:
         try:
             weights = find_weights(network, settings.weights_dir)
-            return make_matcher(name, available_cores(), weights, device, arithmetic)
+            return make_matcher(name, available_cores(), weights, device)
         except WeightsMissing as error:
             log.warning("features %s: matched by nearest neighbours: %s", name, error)
-    return make_matcher(name, available_cores(), arithmetic=arithmetic)
+    return make_matcher(name, available_cores())
 
 
 def _find_light_glue(features: str, settings: Settings, missing: _Missing) -> Path | None:

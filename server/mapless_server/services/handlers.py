@@ -20,7 +20,6 @@ from mapless.v1 import (
 from mapless_server.errors import Unavailable
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Authenticate, CallGuard
-from mapless_server.rpc.call import ARITHMETIC_KEY
 from mapless_server.scheduling import Flow
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -134,8 +133,6 @@ class Services:
     async def open(self, engine: QueueEngine) -> None:
         """Starts to serve, with an engine that has been warmed up."""
         self._engine = engine
-        matcher = engine.tiers[0].pipeline.matcher
-        self._guard.trailers = ((ARITHMETIC_KEY, matcher.pairs.arithmetic.value),)
         await self.set_serving(True)
 
     async def drain(self, delay_s: float, grace_s: float) -> None:

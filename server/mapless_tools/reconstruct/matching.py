@@ -12,7 +12,7 @@ import pycolmap
 
 from mapless.geometry import Array
 from mapless_server.bounds import check_bounds
-from mapless_server.method.features.matching import Arithmetic, mutual_matches_of_ratios
+from mapless_server.method.features.matching import mutual_matches_of_ratios
 from mapless_server.method.features.views import Matches
 from mapless_server.method.pairs.epipolar import fundamental_inliers
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
@@ -74,11 +74,10 @@ def pairs_of(
 class MatchFolder:
     """Matches of pairs, in a file for each photograph of a folder; those that are there are not made again."""
 
-    def __init__(self, folder: Path, features: FeatureFolder, ratio: float, arithmetic: Arithmetic) -> None:
+    def __init__(self, folder: Path, features: FeatureFolder, ratio: float) -> None:
         self._folder = folder
         self._features = features
         self._ratio = ratio
-        self._arithmetic = arithmetic
 
     def match(self, pairs: Sequence[tuple[str, str]], progress: Progress) -> None:
         """Matches each photograph with those that it is paired with."""
@@ -110,7 +109,7 @@ class MatchFolder:
     def _matches(self, first: str, second: str) -> Matches:
         """Nearest descriptors that fit one fundamental matrix; pycolmap takes seconds to find that others do not."""
         views = self._features.view(first), self._features.view(second)
-        found = mutual_matches_of_ratios(views[0].features, views[1].features, (self._ratio,), self._arithmetic)[0]
+        found = mutual_matches_of_ratios(views[0].features, views[1].features, (self._ratio,))[0]
         return found[fundamental_inliers(*views, found, _ITERATIONS)]
 
 

@@ -18,7 +18,7 @@ import pycolmap
 
 from mapless_server import __version__
 from mapless_server.choices import AUTO, BEST_VARIANTS, FEATURES
-from mapless_server.method.features.matching import OPTIONS, fastest_arithmetic
+from mapless_server.method.features.matching import OPTIONS
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.serve.assembly import ANY_ROLL, make_first_features
 from mapless_server.settings import available_cores, load_settings
@@ -149,7 +149,7 @@ def gather(
     files = [features.file(it.name).stem for it in pictures]
     ratio = OPTIONS[kind].query_ratio
     key = _digest(__version__, files, names, pairs, ratio)  # another release may write other files
-    matches = MatchFolder(work / f"matches-{key}", features, ratio, fastest_arithmetic())
+    matches = MatchFolder(work / f"matches-{key}", features, ratio)
     matches.match(pairs, progress)
     return Evidence(kind, features, matches, key)
 

@@ -14,6 +14,7 @@ from support.planted import AnyRatio, same_points
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.kernels import nearest
 from mapless_server.method.features import matching
 from mapless_server.method.features.extractors import FEATURES
 from mapless_server.method.features.matching import (
@@ -21,7 +22,6 @@ from mapless_server.method.features.matching import (
     CorrespondOptions,
     SharedThreads,
     StoredPair,
-    best_of_both,
     mutual_matches,
 )
 from mapless_server.method.features.views import Features, Matches, PosedView, View
@@ -41,6 +41,10 @@ def features(descriptors: Array, keypoints: Array | None = None) -> Features:
         descriptors.astype(np.float32),
         np.ones(n, np.float32),
     )
+
+
+def whole(descriptors: NDArray[np.int64]) -> Features:
+    return replace(features(np.zeros((len(descriptors), 1))), descriptors=descriptors.astype(np.int8))
 
 
 def related(random: np.random.Generator, n: int, m: int, noise: float, size: int = 16) -> tuple[Features, Features]:
@@ -79,26 +83,19 @@ def test_mutual_matches_equal_brute_force(n: int, m: int, noise: float, ratio: f
         assert sorted(turned[:, ::-1].tolist()) == matches.tolist()
 
 
-@pytest.mark.parametrize(("n", "m"), [(2, 3), (130, 500), (300, 128)])
-def test_products_of_whole_numbers_are_those_of_floats(n: int, m: int) -> None:
-    """To the last bit, since sums of up to 127^2 64 are exact as float32; largest numbers included."""
-    pytest.importorskip("torch", reason="the networks extra is not installed")
-    if not matching.has_exact_products():
-        pytest.skip("the processor has no products of int8 that do not saturate")
-    random = random_for("whole", n, m)
-    first, second = (
-        replace(features(np.zeros((k, 64))), descriptors=random.integers(-127, 128, (k, 64)).astype(np.int8))
-        for k in (n, m)
-    )
-    first.descriptors[0] = second.descriptors[-1] = 127
-    a, b = (it.descriptors.astype(np.float32) for it in (first, second))
-    expected = a @ b.T * second.inverse_lengths * first.inverse_lengths[:, None]
-    blocks = [block.copy() for block in matching.cosine_blocks(first, second, matching.Arithmetic.INT8)]
-    assert np.concatenate(blocks).tobytes() == expected.tobytes()
-    plain = first.unit_descriptors() @ second.unit_descriptors().T
-    for either in (False, True):
-        matches = mutual_matches(first, second, 0.99, either, matching.Arithmetic.INT8)
-        assert matches.tolist() == best_of_both(plain.copy(), (0.99,), either=either)[0].tolist()
+@pytest.mark.parametrize(("n", "m"), [(2, 3), (9, 17), (130, 500), (300, 128)])
+def test_compiled_and_plain_matches_are_the_same(n: int, m: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ties included: of descriptors of few different numbers, many are equal."""
+    if not nearest.is_available(64):
+        pytest.skip("not compiled, or the processor has no AVX512-VNNI")
+    random = random_for("compiled", n, m)
+    for most in (1, 127):
+        first, second = (whole(random.integers(-most, most + 1, (k, 64))) for k in (n, m))
+        for either in (False, True):
+            compiled = mutual_matches(first, second, 0.99, either)
+            with monkeypatch.context() as plain:
+                plain.setattr(nearest, "is_available", lambda length: False)
+                assert mutual_matches(first, second, 0.99, either).tolist() == compiled.tolist()
 
 
 def test_ambiguous_descriptors_are_not_matched() -> None:

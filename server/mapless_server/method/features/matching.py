@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -13,42 +12,29 @@ from numpy.typing import NDArray
 
 from mapless_server.bounds import check_bounds
 from mapless_server.choices import EDGEPOINT2
+from mapless_server.kernels import nearest
+from mapless_server.kernels.nearest import Nearest, Whole
 from mapless_server.scheduling import count_helper, may_have_helpers
 
 from .limits import EPIPOLAR_PX
 from .views import Features, Matches, PosedView, View
 
-_ROWS_AT_ONCE = 128
-_FLOAT_ROWS_AT_ONCE = 256
-"""With 2,000 columns a block of 128 rows has 1 MB, as the second-level cache of a core; BLAS is slower with so few."""
+_ROWS_AT_ONCE = 256
+"""With 2,000 columns a block has 2 MB, as the second-level cache of a core; BLAS is slower with fewer rows."""
 
 
-class Arithmetic(Enum):
-    """How descriptors of int8 are multiplied; all others are multiplied as float32.
-
-    A server chooses once, see `fastest_arithmetic`; without a choice it is `FLOAT32`. Cosines differ by rounding.
-    """
-
-    FLOAT32 = "float32"
-    INT8 = "int8"
-    """As whole numbers by torch, in half to four fifths of the time where the processor has instructions for that."""
-
-
-def mutual_matches(
-    first: Features,
-    second: Features,
-    ratio: float,
-    either: bool = False,
-    arithmetic: Arithmetic = Arithmetic.FLOAT32,
-) -> Matches:
+def mutual_matches(first: Features, second: Features, ratio: float, either: bool = False) -> Matches:
     """Mutual nearest neighbours that pass the ratio test from first to second or, if `either`, from second to first."""
     if either:
-        return mutual_matches_of_ratios(first, second, (ratio,), arithmetic)[0]
+        return mutual_matches_of_ratios(first, second, (ratio,))[0]
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), np.int32)
+    if (found := _compiled_nearest(first, second)) is not None:
+        mutual = found.best >= found.best_of_column[found.column]
+        return _passing(found.column, found.best, found.second_best, mutual, ratio)
     nearest, best, second_best = np.empty(len(first), np.intp), *np.empty((2, len(first)), np.float32)
     best_of_column, begin = np.full(len(second), -np.inf, np.float32), 0
-    for cosines in cosine_blocks(first, second, arithmetic):
+    for cosines in cosine_blocks(first, second):
         part, rows = slice(begin, begin + len(cosines)), np.arange(len(cosines))
         nearest[part] = cosines.argmax(axis=1)
         best[part] = cosines[rows, nearest[part]]
@@ -56,75 +42,68 @@ def mutual_matches(
         cosines[rows, nearest[part]] = -1.0
         second_best[part] = cosines.max(axis=1)
         begin = part.stop
-    mutual = best >= best_of_column[nearest]
-    keep = np.flatnonzero(mutual & (best > -1.0) & (1 - best < ratio**2 * (1 - second_best)))
-    return np.stack([keep, nearest[keep]], axis=1).astype(np.int32)
+    return _passing(nearest, best, second_best, best >= best_of_column[nearest], ratio)
 
 
-def mutual_matches_of_ratios(
-    first: Features, second: Features, ratios: Sequence[float], arithmetic: Arithmetic = Arithmetic.FLOAT32
-) -> list[Matches]:
+def mutual_matches_of_ratios(first: Features, second: Features, ratios: Sequence[float]) -> list[Matches]:
     """For each ratio, the mutual nearest neighbours that pass the test from either side, of one comparison."""
     if len(first) < 2 or len(second) < 2:
         return [np.empty((0, 2), np.int32) for _ in ratios]
+    if (found := _compiled_nearest(first, second)) is not None:
+        mutual = found.best >= found.best_of_column[found.column]
+        mutual &= _once(found.column, mutual, len(second))
+        second_best = np.minimum(found.second_best, found.second_of_column[found.column])
+        return [_passing(found.column, found.best, second_best, mutual, ratio) for ratio in ratios]
     similarity = np.empty((len(first), len(second)), np.float32)
-    deque(cosine_blocks(first, second, arithmetic, similarity), 0)
+    deque(cosine_blocks(first, second, similarity), 0)
     return best_of_both(similarity, ratios, either=True)
 
 
+def _compiled_nearest(first: Features, second: Features) -> Nearest | None:
+    """The nearest descriptors of int8 by compiled code; None for others, and where that is not available."""
+    is_whole = first.descriptors.dtype == second.descriptors.dtype == np.int8
+    if not is_whole or not nearest.is_available(first.descriptors.shape[1]):
+        return None
+    ours, theirs = (Whole(it.descriptors.astype(np.int8, copy=False), it.inverse_lengths) for it in (first, second))
+    return nearest.nearest(ours, theirs)
+
+
+def _passing(
+    nearest: NDArray[np.integer],
+    best: NDArray[np.float32],
+    second_best: NDArray[np.float32],
+    mutual: NDArray[np.bool_],
+    ratio: float,
+    smallest: float = -1.0,
+) -> Matches:
+    """The mutual ones (row, column) that pass the ratio test; with a cosine s the distance is sqrt(2 - 2 s)."""
+    keep = np.flatnonzero(mutual & (best > smallest) & (1 - best < ratio**2 * (1 - second_best)))
+    return np.stack([keep, nearest[keep]], axis=1).astype(np.int32)
+
+
+def _once(nearest: NDArray[np.integer], mutual: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
+    """Which rows (N,) are not tied with another one that is as near to the same column."""
+    return np.asarray(np.bincount(nearest[mutual], minlength=columns)[nearest] == 1)
+
+
 def cosine_blocks(
-    first: Features,
-    second: Features,
-    arithmetic: Arithmetic = Arithmetic.FLOAT32,
-    whole: NDArray[np.float32] | None = None,
+    first: Features, second: Features, whole: NDArray[np.float32] | None = None
 ) -> Iterator[NDArray[np.float32]]:
     """Yields the matrix of cosines (N, M) in blocks of rows: of `whole` (N, M), or each overwritten by the next.
 
-    A block fits into the processor's cache.
+    Those of int8 are products of whole numbers, which float32 holds exactly, over the lengths: as `kernels.nearest`
+    computes them, to the last bit.
     """
-    is_whole = first.descriptors.dtype == second.descriptors.dtype == np.int8
-    exact = arithmetic is Arithmetic.INT8 and is_whole
-    rows = _ROWS_AT_ONCE if exact else _FLOAT_ROWS_AT_ONCE
-    block = np.empty((min(rows, len(first)), len(second)), np.float32)
-    starts = range(0, len(first), rows)
-    blocks = (whole[i : i + rows] if whole is not None else block[: len(first) - i] for i in starts)
-    if not exact:
-        ours, theirs = first.unit_descriptors(), second.unit_descriptors().T
-        for i, cosines in zip(starts, blocks, strict=True):
-            yield np.matmul(ours[i : i + rows], theirs, out=cosines)
-        return
-    import torch
-
-    a, b = torch.tensor(first.descriptors), torch.tensor(second.descriptors).T
-    inverse, other_inverse = (torch.from_numpy(it.inverse_lengths) for it in (first, second))
-    products = torch.empty(block.shape, dtype=torch.int32)
-    for i, cosines in zip(starts, blocks, strict=True):
-        part = products[: len(cosines)]
-        torch._int_mm(a[i : i + rows], b, out=part)
-        # Converted first: the product of a whole and a floating-point number takes longer.
-        torch.from_numpy(cosines).copy_(part).mul_(other_inverse).mul_(inverse[i : i + rows, None])
+    exact = first.descriptors.dtype == second.descriptors.dtype == np.int8
+    ours, theirs = (it.descriptors.astype(np.float32) if exact else it.unit_descriptors() for it in (first, second))
+    block = np.empty((min(_ROWS_AT_ONCE, len(first)), len(second)), np.float32)
+    for i in range(0, len(first), _ROWS_AT_ONCE):
+        part = slice(i, min(i + _ROWS_AT_ONCE, len(first)))
+        cosines = np.matmul(ours[part], theirs.T, out=block[: part.stop - i] if whole is None else whole[part])
+        if exact:
+            cosines *= second.inverse_lengths
+            cosines *= first.inverse_lengths[part, None]
         yield cosines
-
-
-def fastest_arithmetic() -> Arithmetic:
-    """Products of int8 where torch has fast and exact ones on this processor, else of float32. Imports torch.
-
-    Without AVX-VNNI or AVX512-VNNI the sums saturate, or are computed one by one, in 20 times the time of float32.
-    """
-    import torch
-
-    capabilities = torch.cpu.get_capabilities()
-    is_fast = capabilities.get("avx512_vnni") or capabilities.get("avx_vnni")
-    return Arithmetic.INT8 if is_fast and has_exact_products() else Arithmetic.FLOAT32
-
-
-def has_exact_products() -> bool:
-    """Whether sums of torch's products of int8 do not saturate on this processor. Imports torch."""
-    import torch
-
-    most = torch.iinfo(torch.int8).max
-    largest = torch.full((_ROWS_AT_ONCE, 64), most, dtype=torch.int8)
-    return bool((torch._int_mm(largest, largest.T) == largest.shape[1] * most**2).all())
 
 
 def best_of_both(
@@ -132,8 +111,7 @@ def best_of_both(
 ) -> list[Matches]:
     """For each ratio, entries of a matrix of cosines (N, M) that are mutual maxima and pass the ratio test by row.
 
-    All are above `smallest`. If `either`, it suffices to pass the ratio test by column. Overwrites the matrix. With a
-    cosine s the distance of descriptors is sqrt(2 - 2 s).
+    All are above `smallest`. If `either`, it suffices to pass the ratio test by column. Overwrites the matrix.
     """
     if not similarity.size:
         return [np.empty((0, 2), np.int32) for _ in ratios]
@@ -145,11 +123,9 @@ def best_of_both(
     similarity[rows[mutual], nearest[mutual]] = -1.0
     second_best = similarity.max(axis=1)
     if either:
-        mutual &= np.bincount(nearest[mutual], minlength=similarity.shape[1])[nearest] == 1  # ties are not matched
+        mutual &= _once(nearest, mutual, similarity.shape[1])
         second_best = np.minimum(second_best, similarity.max(axis=0)[nearest])
-    mutual &= best > smallest
-    kept = [mutual & (1 - best < ratio**2 * (1 - second_best)) for ratio in ratios]
-    return [np.stack([rows[keep], nearest[keep]], axis=1).astype(np.int32) for keep in kept]
+    return [_passing(nearest, best, second_best, mutual, ratio, smallest) for ratio in ratios]
 
 
 ItemT = TypeVar("ItemT")
@@ -335,10 +311,9 @@ class SharedThreads:
 class NearestNeighbours:
     """Matches mutual nearest neighbours that pass the ratio test, for any descriptor."""
 
-    def __init__(self, ratio: float, threads: SharedThreads, arithmetic: Arithmetic = Arithmetic.FLOAT32) -> None:
+    def __init__(self, ratio: float, threads: SharedThreads) -> None:
         self.ratio = ratio
         self._threads = threads
-        self._arithmetic = arithmetic
 
     def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
         """See QueryMatching.match."""
@@ -348,6 +323,6 @@ class NearestNeighbours:
 
         def with_one(reference: PosedView) -> Matches:
             check()
-            return mutual_matches(ours, reference.view.features, self.ratio, arithmetic=self._arithmetic)
+            return mutual_matches(ours, reference.view.features, self.ratio)
 
         return tuple(self._threads.map(with_one, references))

@@ -19,7 +19,6 @@ from mapless_server.cache import LruCache
 
 from ..features.matching import (
     OPTIONS,
-    Arithmetic,
     CorrespondOptions,
     NearestNeighbours,
     PairMatching,
@@ -185,13 +184,12 @@ class Matcher:
         threads: int = 1,
         query_matching: QueryMatching | None = None,
         pair_matching: PairMatching | None = None,
-        arithmetic: Arithmetic = Arithmetic.FLOAT32,
     ) -> None:
         self.options = options or CorrespondOptions()
-        self.pairs = ReferencePairs(self.options, pair_matching, arithmetic)
+        self.pairs = ReferencePairs(self.options, pair_matching)
         self.pair_s: float | None = None
         self._threads = SharedThreads(threads)
-        self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads, arithmetic)
+        self._query_matching = query_matching or NearestNeighbours(self.options.query_ratio, self._threads)
         self._structures: LruCache[object] = LruCache(self.options.structure_bytes)
 
     def correspond(
@@ -337,7 +335,6 @@ def make_matcher(
     threads: int = 1,
     weights: Path | None = None,
     device: str = "cpu",
-    arithmetic: Arithmetic = Arithmetic.FLOAT32,
 ) -> Matcher:
     """Makes the matcher for an extractor.
 
@@ -347,7 +344,6 @@ def make_matcher(
         weights: weights of the features' LightGlue; None takes nearest neighbours alone. On a CUDA device LightGlue
             matches the query; on a CPU, where it is slow, it is the `Matcher.pair_matching`.
         device: "cpu" or a CUDA device, for LightGlue.
-        arithmetic: arithmetic of nearest neighbours.
 
     Raises:
         ValueError: unknown name, or features without a LightGlue.
@@ -357,7 +353,7 @@ def make_matcher(
     if features not in OPTIONS:
         raise ValueError(f"unknown features {features!r}; known: {', '.join(OPTIONS)}")
     if weights is None:
-        return Matcher(OPTIONS[features], threads, arithmetic=arithmetic)
+        return Matcher(OPTIONS[features], threads)
     from mapless_server.networks.lightglue import load_lightglue
 
     from ..features.lightglue import LightGlueMatching
@@ -365,5 +361,5 @@ def make_matcher(
     network, sha256 = load_lightglue(features, weights)
     light_glue = LightGlueMatching(network, device, sha256=sha256)
     if device == "cpu":
-        return Matcher(OPTIONS[features], threads, pair_matching=light_glue, arithmetic=arithmetic)
-    return Matcher(OPTIONS[features], threads, light_glue, arithmetic=arithmetic)
+        return Matcher(OPTIONS[features], threads, pair_matching=light_glue)
+    return Matcher(OPTIONS[features], threads, light_glue)

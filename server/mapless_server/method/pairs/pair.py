@@ -17,7 +17,6 @@ import numpy as np
 from mapless_server.cache import LruCache
 
 from ..features.matching import (
-    Arithmetic,
     CorrespondOptions,
     PairMatching,
     StoredPairs,
@@ -139,7 +138,6 @@ class ReferencePairs:
         options: options of matching.
         pair_matching: makes the strong matches; None if nothing does.
         stationary: options of finding what is fixed to the cameras.
-        arithmetic: arithmetic of nearest neighbours.
         stored: where pairs that are not cached are looked up; None looks up none.
     """
 
@@ -147,11 +145,9 @@ class ReferencePairs:
         self,
         options: CorrespondOptions,
         pair_matching: PairMatching | None = None,
-        arithmetic: Arithmetic = Arithmetic.FLOAT32,
     ) -> None:
         self.options = options
         self.pair_matching = pair_matching
-        self.arithmetic = arithmetic
         self.stationary = StationaryOptions()
         self.stored: StoredPairs | None = None
         self._cached: LruCache[PairMatches] = LruCache(options.remembered_pairs)
@@ -262,7 +258,7 @@ class ReferencePairs:
 
     def _match_strictly(self, first: PosedView, second: PosedView) -> Matches:
         ratios, features = (self.options.reference_ratio, self.options.distinct_ratio), first.view.features
-        matches, distinct = mutual_matches_of_ratios(features, second.view.features, ratios, self.arithmetic)
+        matches, distinct = mutual_matches_of_ratios(features, second.view.features, ratios)
         return self._filtered(first, second, matches, distinct)
 
     def _match_strongly(self, first: PosedView, second: PosedView, pause: Callable[[], None]) -> Matches:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_server.method.features.matching import Arithmetic, mutual_matches
+from mapless_server.method.features.matching import mutual_matches
 from mapless_server.method.features.tracks import Tracks, build_tracks
 from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.pairs.correspond import Correspondences
@@ -38,11 +38,9 @@ class PairMatches:
     `method.pairs.correspond.Matcher` caches matches that agree with the given poses, which are what is audited here.
     """
 
-    def __init__(
-        self, ratio: float = 0.9, cached_pairs: int = 20_000, arithmetic: Arithmetic = Arithmetic.FLOAT32
-    ) -> None:
+    def __init__(self, ratio: float = 0.9, cached_pairs: int = 20_000) -> None:
         """Uses the `ratio` of the features, see `CorrespondOptions`."""
-        self._ratio, self._arithmetic = ratio, arithmetic
+        self._ratio = ratio
         self._cache: LruCache[Matches] = LruCache(cached_pairs)
 
     def match(self, first: PosedView, second: PosedView) -> Matches:
@@ -52,8 +50,8 @@ class PairMatches:
         key = first.key, second.key
         matches = self._cache.get(key)
         if matches is None:
-            features, arithmetic = first.view.features, self._arithmetic
-            matches = mutual_matches(features, second.view.features, self._ratio, arithmetic=arithmetic)
+            features = first.view.features
+            matches = mutual_matches(features, second.view.features, self._ratio)
             self._cache.put(key, matches)
         return matches
 

@@ -1,0 +1,212 @@
+/* Nearest neighbours of descriptors of int8 by their cosines: `nearest`, see nearest.py.
+ *
+ * The cosine of rows i and j is (float(a_i . b_j) * inverse_length_j) * inverse_length_i. The product of whole numbers
+ * is exact, so the twin in Python has the same bits. The matrix of cosines is never stored: a tile of 8 rows and 16
+ * columns is multiplied in registers, and the two largest of each row and column are updated.
+ */
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#if defined(__x86_64__) && defined(__GNUC__)
+#include <immintrin.h>
+#define HAS_VNNI (__builtin_cpu_supports("avx512vnni") && __builtin_cpu_supports("avx512bw"))
+#define VNNI __attribute__((target("avx512f,avx512bw,avx512vnni")))
+
+enum { ROWS = 8, COLUMNS = 16, LOWEST = -2 /* below any cosine */ };
+
+/* The instruction multiplies unsigned by signed numbers: 128 is added to the first, and 128 times the sum of the second
+ * subtracted from the product. */
+enum { BIAS = 128 };
+
+typedef struct {
+    const int8_t *numbers; /* (count, length) */
+    const float *inverse_lengths;
+    Py_ssize_t count;
+} Descriptors;
+
+/* Columns in groups of 16, each four numbers of 16 columns after the other; zeros beyond the last column. */
+typedef struct {
+    int8_t *numbers;
+    int32_t *minus_bias;
+    float *inverse_lengths;
+    Py_ssize_t groups;
+} Packed;
+
+typedef struct {
+    int32_t *nearest;       /* (rows) */
+    float *best, *second;   /* (rows) */
+    float *column_best, *column_second; /* (groups * 16) */
+} Maxima;
+
+static Py_ssize_t rounded_up(Py_ssize_t count, Py_ssize_t step) { return (count + step - 1) / step * step; }
+
+static void pack_columns(const Descriptors *from, Py_ssize_t length, Packed *to) {
+    Py_ssize_t padded = to->groups * COLUMNS;
+    memset(to->numbers, 0, padded * length);
+    memset(to->minus_bias, 0, padded * sizeof(int32_t));
+    memset(to->inverse_lengths, 0, padded * sizeof(float));
+    memcpy(to->inverse_lengths, from->inverse_lengths, from->count * sizeof(float));
+    for (Py_ssize_t j = 0; j < from->count; j++) {
+        const int8_t *row = from->numbers + j * length;
+        int8_t *group = to->numbers + j / COLUMNS * COLUMNS * length + j % COLUMNS * 4;
+        int32_t sum = 0;
+        for (Py_ssize_t k = 0; k < length; k++) sum += row[k];
+        to->minus_bias[j] = -BIAS * sum;
+        for (Py_ssize_t k = 0; k < length; k += 4) memcpy(group + k * COLUMNS, row + k, 4);
+    }
+}
+
+static void pack_rows(const Descriptors *from, Py_ssize_t length, uint8_t *to) {
+    Py_ssize_t size = from->count * length;
+    for (Py_ssize_t k = 0; k < size; k++) to[k] = (uint8_t)(from->numbers[k] + BIAS);
+    memset(to + size, BIAS, rounded_up(from->count, ROWS) * length - size);
+}
+
+/* The largest of all lanes and its column, the first of equal ones; and the second-largest. */
+static void reduce_lanes(const float best[COLUMNS], const float second[COLUMNS], const int32_t at[COLUMNS],
+                         const Maxima *to, Py_ssize_t row) {
+    int first = 0;
+    for (int l = 1; l < COLUMNS; l++)
+        if (best[l] > best[first] || (best[l] == best[first] && at[l] < at[first])) first = l;
+    float next = second[first];
+    for (int l = 0; l < COLUMNS; l++)
+        if (l != first && best[l] > next) next = best[l];
+    to->nearest[row] = at[first];
+    to->best[row] = best[first];
+    to->second[row] = next;
+}
+
+VNNI static void find(const uint8_t *rows, const float *inverse_lengths, Py_ssize_t count, const Packed *columns,
+                      Py_ssize_t column_count, Py_ssize_t length, const Maxima *to) {
+    const __m512i lanes = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+    const __m512 lowest = _mm512_set1_ps(LOWEST);
+    for (Py_ssize_t g = 0; g < columns->groups; g++) {
+        _mm512_storeu_ps(to->column_best + g * COLUMNS, lowest);
+        _mm512_storeu_ps(to->column_second + g * COLUMNS, lowest);
+    }
+    for (Py_ssize_t i = 0; i < count; i += ROWS) {
+        const int used = count - i < ROWS ? (int)(count - i) : ROWS;
+        __m512 best[ROWS], second[ROWS];
+        __m512i at[ROWS];
+        for (int r = 0; r < ROWS; r++) best[r] = second[r] = lowest, at[r] = _mm512_setzero_si512();
+        for (Py_ssize_t g = 0; g < columns->groups; g++) {
+            const int8_t *numbers = columns->numbers + g * COLUMNS * length;
+            __m512i products[ROWS];
+            for (int r = 0; r < ROWS; r++) products[r] = _mm512_loadu_si512(columns->minus_bias + g * COLUMNS);
+            for (Py_ssize_t k = 0; k < length; k += 4) {
+                const __m512i of_columns = _mm512_loadu_si512(numbers + k * COLUMNS);
+                for (int r = 0; r < ROWS; r++) {
+                    int32_t of_row;
+                    memcpy(&of_row, rows + (i + r) * length + k, 4);
+                    products[r] = _mm512_dpbusd_epi32(products[r], _mm512_set1_epi32(of_row), of_columns);
+                }
+            }
+            const Py_ssize_t left = column_count - g * COLUMNS;
+            const __mmask16 valid = left < COLUMNS ? (__mmask16)((1 << left) - 1) : 0xffff;
+            const __m512 inverse = _mm512_loadu_ps(columns->inverse_lengths + g * COLUMNS);
+            const __m512i column = _mm512_add_epi32(lanes, _mm512_set1_epi32((int32_t)(g * COLUMNS)));
+            __m512 column_best = _mm512_loadu_ps(to->column_best + g * COLUMNS);
+            __m512 column_second = _mm512_loadu_ps(to->column_second + g * COLUMNS);
+            for (int r = 0; r < used; r++) {
+                const __m512 scaled = _mm512_mul_ps(_mm512_cvtepi32_ps(products[r]), inverse);
+                const __m512 cosine = _mm512_mask_mul_ps(lowest, valid, scaled, _mm512_set1_ps(inverse_lengths[i + r]));
+                at[r] = _mm512_mask_mov_epi32(at[r], _mm512_cmp_ps_mask(cosine, best[r], _CMP_GT_OQ), column);
+                second[r] = _mm512_max_ps(second[r], _mm512_min_ps(best[r], cosine));
+                best[r] = _mm512_max_ps(best[r], cosine);
+                column_second = _mm512_max_ps(column_second, _mm512_min_ps(column_best, cosine));
+                column_best = _mm512_max_ps(column_best, cosine);
+            }
+            _mm512_storeu_ps(to->column_best + g * COLUMNS, column_best);
+            _mm512_storeu_ps(to->column_second + g * COLUMNS, column_second);
+        }
+        for (int r = 0; r < used; r++) {
+            float best_of[COLUMNS], second_of[COLUMNS];
+            int32_t at_of[COLUMNS];
+            _mm512_storeu_ps(best_of, best[r]);
+            _mm512_storeu_ps(second_of, second[r]);
+            _mm512_storeu_si512(at_of, at[r]);
+            reduce_lanes(best_of, second_of, at_of, to, i + r);
+        }
+    }
+}
+
+/* False without memory. */
+static int find_nearest(const Descriptors *first, const Descriptors *second, Py_ssize_t length, const Maxima *to) {
+    const Py_ssize_t groups = rounded_up(second->count, COLUMNS) / COLUMNS, padded = groups * COLUMNS;
+    const Py_ssize_t row_bytes = rounded_up(first->count, ROWS) * length;
+    uint8_t *memory = malloc(row_bytes + padded * (length + sizeof(int32_t) + 3 * sizeof(float)));
+    if (memory == NULL) return 0;
+    float *floats = (float *)memory; /* what needs alignment comes first */
+    Packed columns = {.inverse_lengths = floats, .minus_bias = (int32_t *)(floats + 3 * padded), .groups = groups};
+    columns.numbers = (int8_t *)(columns.minus_bias + padded);
+    uint8_t *rows = (uint8_t *)columns.numbers + padded * length;
+    Maxima found = *to;
+    found.column_best = floats + padded, found.column_second = floats + 2 * padded;
+    pack_columns(second, length, &columns);
+    pack_rows(first, length, rows);
+    find(rows, first->inverse_lengths, first->count, &columns, second->count, length, &found);
+    memcpy(to->column_best, found.column_best, second->count * sizeof(float));
+    memcpy(to->column_second, found.column_second, second->count * sizeof(float));
+    free(memory);
+    return 1;
+}
+
+#else
+#define HAS_VNNI 0
+typedef struct {
+    const int8_t *numbers;
+    const float *inverse_lengths;
+    Py_ssize_t count;
+} Descriptors;
+typedef struct {
+    int32_t *nearest;
+    float *best, *second, *column_best, *column_second;
+} Maxima;
+static int find_nearest(const Descriptors *first, const Descriptors *second, Py_ssize_t length, const Maxima *to) {
+    (void)first, (void)second, (void)length, (void)to;
+    return 0;
+}
+#endif
+
+enum { FIRST, SECOND, FIRST_LENGTHS, SECOND_LENGTHS, NEAREST, BEST, SECOND_BEST, COLUMN_BEST, COLUMN_SECOND, BUFFERS };
+
+static PyObject *nearest(PyObject *Py_UNUSED(module), PyObject *arguments) {
+    Py_buffer b[BUFFERS] = {{0}};
+    Py_ssize_t length;
+    PyObject *result = NULL;
+    if (!PyArg_ParseTuple(arguments, "ny*y*y*y*w*w*w*w*w*", &length, &b[0], &b[1], &b[2], &b[3], &b[4], &b[5], &b[6],
+                          &b[7], &b[8]))
+        return NULL;
+    const Py_ssize_t rows = b[FIRST_LENGTHS].len / 4, columns = b[SECOND_LENGTHS].len / 4;
+    int fits = length > 0 && length % 4 == 0 && b[FIRST].len == rows * length && b[SECOND].len == columns * length;
+    for (int i = NEAREST; i < BUFFERS; i++) fits &= b[i].len == 4 * (i < COLUMN_BEST ? rows : columns);
+    if (!fits || !HAS_VNNI) {
+        PyErr_SetString(PyExc_ValueError, "the sizes of the arrays do not fit, or the processor has no VNNI");
+    } else {
+        const Descriptors first = {b[FIRST].buf, b[FIRST_LENGTHS].buf, rows};
+        const Descriptors second = {b[SECOND].buf, b[SECOND_LENGTHS].buf, columns};
+        const Maxima to = {b[NEAREST].buf, b[BEST].buf, b[SECOND_BEST].buf, b[COLUMN_BEST].buf, b[COLUMN_SECOND].buf};
+        int done;
+        Py_BEGIN_ALLOW_THREADS
+        done = find_nearest(&first, &second, length, &to);
+        Py_END_ALLOW_THREADS
+        result = done ? Py_NewRef(Py_None) : PyErr_NoMemory();
+    }
+    for (int i = 0; i < BUFFERS; i++) PyBuffer_Release(&b[i]);
+    return result;
+}
+
+static PyObject *is_fast(PyObject *Py_UNUSED(module), PyObject *Py_UNUSED(arguments)) {
+    return PyBool_FromLong(HAS_VNNI);
+}
+
+static PyMethodDef methods[] = {
+    {"nearest", nearest, METH_VARARGS, "Writes the two largest cosines of each row and column; see nearest.py."},
+    {"is_fast", is_fast, METH_NOARGS, "Whether this processor has the instructions."},
+    {NULL, NULL, 0, NULL},
+};
+static struct PyModuleDef definition = {PyModuleDef_HEAD_INIT, "_nearest", NULL, 0, methods, NULL, NULL, NULL, NULL};
+PyMODINIT_FUNC PyInit__nearest(void) { return PyModuleDef_Init(&definition); }
