@@ -13,7 +13,17 @@ from unittest.mock import MagicMock, Mock
 import numpy as np
 import pytest
 import yaml  # type: ignore[import-untyped]
-from support.bags import BASE_FROM_CAMERA, at, class_of, compressed, drive, info, pose_with_covariance, transforms
+from support.bags import (
+    BASE_FROM_CAMERA,
+    at,
+    class_of,
+    compressed,
+    drive,
+    image,
+    info,
+    pose_with_covariance,
+    transforms,
+)
 from support.servers import CAMERA, PHOTO, make_scene, pose, serving
 from support.waiting import wait_until
 
@@ -91,7 +101,7 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
 ) -> None:
     with serving(tmp_path / "data") as server, Client(server.address) as client:
         make_scene(client, "hall", 2)
-        given = {"address": server.address, "scene": "hall", "compressed": True}
+        given = {"address": server.address, "scene": "hall", "compressed": True, "depth": True}
         monkeypatch.setattr(StandInNode, "parameters", given)
         node = node_module.MaplessNode()
         poses, reports = node.published["visual_localization/pose"], node.published["/diagnostics"]
@@ -104,6 +114,9 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
             node.callbacks["visual_localization/camera_info_0"](info(CAMERA))
             assert node.logged[-1] == "the camera is K and D of CameraInfo (parameter rectified: False)"
             assert trigger(None, response).success
+            deep = np.full((64, 96), 2000, np.uint16)
+            node.callbacks["visual_localization/depth_camera_info_0"](info(CAMERA))
+            node.callbacks["visual_localization/depth_0"](image(at(1.01), deep, "16UC1"))
             node.callbacks["visual_localization/image_0"](shot(1.0))
             wait_until(lambda: poses)
             map_from_base = pose(0).compose(BASE_FROM_CAMERA.inverse())  # what that server answers
@@ -112,6 +125,7 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
             assert poses[0].header.frame_id == "map"
             assert np.linalg.eigvalsh(np.reshape(poses[0].pose.covariance, (6, 6))).min() > 0
             assert reports[0].status[0].level == 0
+            assert {it.key: it.value for it in reports[0].status[0].values}["depth"] == "sent"
             node.callbacks["timer"]()
             (edge,) = ros.tf2_ros.TransformBroadcaster.return_value.sendTransform.call_args.args
             assert (edge.header.frame_id, edge.child_frame_id) == ("map", "odom")

@@ -11,6 +11,7 @@ image is the optical frame. The world is the scene's; for ROS it should have z u
 
 from .camera_infos import CameraInfos, rectified_differs, says_rectified
 from .cameras import RosCamera, camera_from_info
+from .depths import Depths, RosDepth
 from .images import pixels_from_image
 from .localizer import Localizer, LocalizerOptions, Outcome
 from .messages import Messages
@@ -18,11 +19,13 @@ from .poses import pose_of_body, stamp_ns_of, transform_from_message, transform_
 
 __all__ = [
     "CameraInfos",
+    "Depths",
     "Localizer",
     "LocalizerOptions",
     "Messages",
     "Outcome",
     "RosCamera",
+    "RosDepth",
     "camera_from_info",
     "pixels_from_image",
     "pose_of_body",

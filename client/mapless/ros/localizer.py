@@ -4,13 +4,14 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from mapless.answers import LocalizationResult, PriorCheck, Rejected
 from mapless.client import Client
+from mapless.depth import DepthImage
 from mapless.errors import MaplessError
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless.groups import SequenceFrame, SequenceLocalization
@@ -18,6 +19,7 @@ from mapless.priors import PosePrior, Priors
 from mapless.requests import ImageSource, read_mask
 
 from .cameras import RosCamera
+from .depths import RosDepth
 from .poses import pose_of_body, stamp_ns_of, time_of, transform_from_pose
 
 Lookup = Callable[[str, str, int], RigidTransform]
@@ -166,8 +168,12 @@ class Localizer:
         with self._lock:
             self._guess = _Guess(map_from_base, covariance, stamp_ns, odom_from_base)
 
-    def localize(self, message: Any, camera: RosCamera) -> Outcome:
-        """Localizes a sensor_msgs/Image or CompressedImage; a failure is an outcome, too."""
+    def localize(self, message: Any, camera: RosCamera, find_depth: Callable[[int], RosDepth] | None = None) -> Outcome:
+        """Localizes a sensor_msgs/Image or CompressedImage; a failure is an outcome, too.
+
+        `find_depth`, of `Depths`, gives the depth of a photograph by its stamp. Without a usable one the photograph is
+        localized alone, and the outcome's value `depth` says why.
+        """
         stamp_ns = stamp_ns_of(message.header.stamp)
         if self._last_ns is not None and stamp_ns < self._last_ns:
             self._recent.clear()
@@ -180,6 +186,7 @@ class Localizer:
             odom_from_body = self._odometry(body, stamp_ns)
             priors = Priors(pose=self._prior(stamp_ns, odom_from_body, extrinsics))
             photo = camera.photo(message)
+            depth, about_depth = self._depth(stamp_ns, camera_frame, camera, find_depth)
             coverage, timeout_s = self._options.coverage, self._options.timeout_s
             answer: _Answer = self._client.localize(
                 photo,
@@ -189,6 +196,7 @@ class Localizer:
                 coverage=coverage,
                 capture_time=time_of(stamp_ns),
                 mask=self._mask,
+                depth=depth,
                 timeout_s=timeout_s,
             )
             if self._options.sequence_length and odom_from_body is not None:
@@ -196,7 +204,7 @@ class Localizer:
                 # The last answer as a prior of several would be counted several times.
                 own = Priors() if self._options.use_last_pose else priors
                 frame = SequenceFrame(photo, camera.camera, tracked, time_of(stamp_ns), priors=own, mask=self._mask)
-                self._recent.append(frame)
+                self._recent.append(replace(frame, depth=depth))
                 if isinstance(answer, Rejected) and len(self._recent) > 1:
                     together = self._client.localize_sequence(
                         list(self._recent), self._options.scene, coverage=coverage, timeout_s=timeout_s
@@ -206,7 +214,22 @@ class Localizer:
             return Outcome(stamp_ns, FAILED, f"tf: {error}", frame=body)
         except (MaplessError, ValueError) as error:
             return Outcome(stamp_ns, FAILED, str(error), frame=body)
-        return self._outcome(answer, stamp_ns, body, extrinsics, odom_from_body)
+        outcome = self._outcome(answer, stamp_ns, body, extrinsics, odom_from_body)
+        return replace(outcome, values={**outcome.values, **about_depth})
+
+    def _depth(
+        self, stamp_ns: int, camera_frame: str, camera: RosCamera, find: Callable[[int], RosDepth] | None
+    ) -> tuple[DepthImage | None, dict[str, str]]:
+        """The depth of a photograph, and what diagnostics say of it."""
+        if find is None:
+            return None, {}
+        try:
+            found = find(stamp_ns)
+            is_same = found.frame == camera_frame
+            pose = None if is_same else self._lookup(camera_frame, found.frame, stamp_ns)
+            return found.image(camera, pose), {"depth": "sent"}
+        except (LookupError, ValueError) as error:
+            return None, {"depth": f"none: {error}"}
 
     def _outcome(
         self,

@@ -39,6 +39,10 @@ PARAMETERS: dict[str, Any] = {
     "timeout": 5.0,
     "sequence_length": 0,
     "mask": "",
+    "depth": False,
+    "depth_compressed": False,
+    "depth_sensor": "unknown",
+    "depth_tolerance": 0.02,
     "compressed": False,
     "rectified": False,
     "publish_tf": True,
@@ -82,6 +86,10 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._cameras = mapless.ros.CameraInfos(self._given["rectified"], CAMERA_INFOS_KEPT)
         self._is_camera_said = False
+        self._depths: mapless.ros.Depths | None = None
+        if self._given["depth"]:
+            known = mapless.DepthSensor(self._given["depth_sensor"])
+            self._depths = mapless.ros.Depths(known, self._given["depth_tolerance"])
         self._image: Any = None
         self._edge: tuple[str, RigidTransform] | None = None
         self._is_triggered = self._is_closed = False
@@ -90,6 +98,12 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         sensor = qos_profile_sensor_data
         self.create_subscription(CameraInfo, "visual_localization/camera_info_0", self._on_camera, sensor)
         self.create_subscription(kind, IMAGE_TOPIC, self._on_image, sensor)
+        if self._depths is not None:
+            depth_kind = CompressedImage if self._given["depth_compressed"] else Image
+            self.create_subscription(
+                CameraInfo, "visual_localization/depth_camera_info_0", self._on_depth_camera, sensor
+            )
+            self.create_subscription(depth_kind, "visual_localization/depth_0", self._depths.add, sensor)
         self.create_subscription(PoseWithCovarianceStamped, "/initialpose", self._on_guess, 1)
         self.create_service(Trigger, "visual_localization/trigger_localization", self._on_trigger)
         if self._given["publish_tf"]:
@@ -125,6 +139,13 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         if not self._is_camera_said:
             self._is_camera_said = True
             self._say_camera(message)
+
+    def _on_depth_camera(self, message: Any) -> None:
+        assert self._depths is not None
+        try:
+            self._depths.add_camera(message, self.get_clock().now().nanoseconds)
+        except ValueError as error:
+            self.get_logger().error(f"depth: {error}", throttle_duration_sec=10.0)
 
     def _say_camera(self, message: Any) -> None:
         """Logs which camera of CameraInfo is used, and warns where the topic's name says that it is the other."""
@@ -175,7 +196,10 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
                 continue
             with self._changed:
                 self._is_triggered = False
-            outcome = self._localizer.localize(message, camera)
+            find_depth = None if self._depths is None else self._depths.at
+            outcome = self._localizer.localize(message, camera, find_depth)
+            if (about_depth := outcome.values.get("depth", "")).startswith("none"):
+                self.get_logger().warning(f"depth: {about_depth}", throttle_duration_sec=5.0)
             if not self._is_closed:
                 self._publish(outcome)
 
