@@ -67,9 +67,11 @@ class DepthFile:
         """Reads the files; OSError, or ValueError, which names the file, if its format is not as it should be."""
         confidence = b"" if self.confidence_path is None else self.confidence_path.read_bytes()
         data, size = self.path.read_bytes(), self.size
-        if self.decode is not None:
-            with named(str(self.path)):
+        with named(str(self.path)):
+            if self.decode is not None:
                 data, size = self.decode(data)
+            if size is not None and len(data) != 4 * size[0] * size[1]:
+                raise ValueError(f"{size[0]}x{size[1]} values of 4 bytes are expected, {len(data)} bytes are there")
         return DepthImage(
             data,
             self.unit_m,

@@ -9,7 +9,8 @@ import numpy as np
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_tools.ingest.formats.icl_nuim import CAMERA as ICL_CAMERA
 from mapless_tools.ingest.formats.seven_scenes import CAMERA_FROM_DEPTH_CAMERA, DEPTH_CAMERA
-from support.depths import planted_png, png
+from mapless_tools.ingest.formats.writing import PosedImage, model_texts
+from support.depths import planted_depth_m, planted_png, png
 from support.images import encode, textured
 from support.layouts import CAMERA, opengl, truth, write_image, write_seven_scenes, write_twelve_scenes
 
@@ -79,12 +80,76 @@ def polycam(folder: Path) -> Path:
     return folder
 
 
+def colmap_dense(folder: Path) -> Path:
+    """The workspace of a dense reconstruction: undistorted images, their model, and maps of half their size."""
+    for i in range(len(TRUTH.poses)):
+        write_image(folder / "images" / f"cam/{i}.png", seed=i)
+    images = [PosedImage(f"cam/{i}.png", CAMERA, pose) for i, pose in enumerate(TRUTH.poses)]
+    (folder / "sparse").mkdir()
+    for name, text in model_texts(images).items():
+        (folder / "sparse" / name).write_text(text)
+    maps = folder / "stereo" / "depth_maps" / "cam"
+    maps.mkdir(parents=True)
+    (maps / "0.png.geometric.bin").write_bytes(colmap_map(_with_hole(planted_depth_m(CAMERA.resized(48, 32)))))
+    return folder
+
+
+def colmap_map(depth: Array) -> bytes:
+    """A depth map as COLMAP writes it."""
+    return f"{depth.shape[1]}&{depth.shape[0]}&1&".encode() + depth.astype("<f4").tobytes()
+
+
+def kapture(folder: Path) -> Path:
+    """A rig with a camera and, beside it, a depth sensor, whose depth is there raw and registered to the camera."""
+    sensors = folder / "sensors"
+    raw = Camera(64, 48, 57.2, 57.5, 31.5, 23.5)
+    poses = [pose.compose(BESIDE) for pose in TRUTH.poses]  # the rig's are the depth sensor's
+    for i in range(len(poses)):
+        write_image(sensors / "records_data" / f"{i}.png", seed=i)
+    rows = {
+        "sensors": [
+            f"colour, , camera, {_pinhole(CAMERA)}",
+            f"raw, kinect, depth, {_pinhole(raw)}",
+            f"reg, , depth, {_pinhole(CAMERA)}",
+        ],
+        "rigs": [f"rig, {it}, {_inverse_words(BESIDE.inverse())}" for it in ("colour", "reg")]
+        + [f"rig, raw, {_inverse_words(RigidTransform.identity())}"],
+        "trajectories": [f"{i}, rig, {_inverse_words(pose)}" for i, pose in enumerate(poses)],
+        "records_camera": [f"{i}, colour, {i}.png" for i in range(len(poses))],
+        "records_depth": ["0, raw, 0.depth", "0, reg, 0.depth.reg"],
+    }
+    for name, lines in rows.items():
+        (sensors / f"{name}.txt").write_text("\n".join(["# kapture format: 1.1", *lines]) + "\n")
+    for path, depth in (("0.depth.reg", planted_depth_m(CAMERA)), ("0.depth", planted_depth_m(raw, BESIDE))):
+        (sensors / "records_data" / path).write_bytes(_with_hole(depth).astype("<f4").tobytes())
+    return folder
+
+
 LAYOUTS: Mapping[str, Callable[[Path], Path]] = {
     "7scenes": seven_scenes,
     "12scenes": twelve_scenes,
     "icl": icl_nuim,
     "arkit": polycam,
+    "colmap": colmap_dense,
+    "kapture": kapture,
 }
+
+
+def _with_hole(depth: Array) -> Array:
+    depth = depth.copy()
+    depth[0, 0] = 0
+    return depth
+
+
+def _pinhole(camera: Camera) -> str:
+    k = camera
+    numbers = f"{k.focal_x_px}, {k.focal_y_px}, {k.principal_x_px + 0.5}, {k.principal_y_px + 0.5}"
+    return f"PINHOLE, {k.width_px}, {k.height_px}, {numbers}"
+
+
+def _inverse_words(pose: RigidTransform) -> str:
+    q, t = pose.inverse().quaternion(), pose.inverse().translation.tolist()
+    return ", ".join(map(repr, [q.w, q.x, q.y, q.z, *t]))
 
 
 def _confidence(camera: Camera, kinds: tuple[int, int, int]) -> np.ndarray:

@@ -246,3 +246,41 @@ def test_depths_come_back_bit_by_bit(server: RunningServer, client: Client, tmp_
         assert (done.exit_code, text in done.stdout) == (0, True), done.output
     hashes = [it.depth_sha256 for it in client.list_references(again)]
     assert hashes == [it.depth_sha256 for it in client.list_references(scene)] == [full.sha256, metres.sha256, ""]
+
+
+def test_kapture_has_depths_in_metres_and_colmap_none(server: RunningServer, client: Client, tmp_path: Path) -> None:
+    """Uncertain values are left out, the sensor's kind, camera and place kept; COLMAP's export says so."""
+    scene = f"deep-{time.monotonic_ns()}"
+    values, certain = np.full((60, 80), 1500, np.uint16), np.full((60, 80), 2, np.uint8)
+    values[3, 4], certain[5, 6] = 65535, 1
+    depth = DepthImage(
+        encode(".png", values),
+        0.0002,
+        None,
+        DepthSensor.STEREO,
+        CAMERA.resized(80, 60),
+        RigidTransform(np.eye(3), np.array([-0.0225, -0.005, 0.0])),
+        encode(".png", certain),
+        2,
+    )
+    client.create_scene(scene)
+    new = [encode(".png", textured(seed=i)) for i in range(2)]
+    client.add_reference(scene, NewReference("r0", new[0], CAMERA, truth().poses[0], depth=depth))
+    client.add_reference(scene, NewReference("r1", new[1], CAMERA, truth().poses[1]))
+    done = run("export", scene, tmp_path / "kapture", "--format", "kapture", "--address", server.address)
+    assert (done.exit_code, "note" in done.stderr) == (0, False), done.output
+    found, without = (frame.depth for frame in read_dataset(tmp_path / "kapture").frames)
+    assert (without, found is not None) == (None, True)
+    assert found is not None
+    metres = np.frombuffer(found.read().data, "<f4").reshape(60, 80)
+    expected = np.full((60, 80), 0.3, np.float32)
+    expected[3, 4] = expected[5, 6] = 0
+    np.testing.assert_allclose(metres, expected)
+    assert found.sensor is DepthSensor.STEREO
+    assert found.camera is not None
+    np.testing.assert_allclose(found.camera.matrix(), CAMERA.resized(80, 60).matrix(), atol=1e-9)
+    assert found.camera_from_depth_camera is not None
+    np.testing.assert_allclose(found.camera_from_depth_camera.translation, [-0.0225, -0.005, 0.0], atol=1e-9)
+    done = run("export", scene, tmp_path / "colmap", "--format", "colmap", "--address", server.address)
+    assert "colmap has no depth, that of 1 references is not written" in done.stderr
+    assert not list((tmp_path / "colmap").rglob("*depth*"))

@@ -4,13 +4,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.depth_layouts import LAYOUTS, TRUTH
-from support.depths import assert_planted, png
-from support.layouts import assert_same_pose
+from support.depth_layouts import LAYOUTS, TRUTH, colmap_map
+from support.depths import assert_planted, planted_depth_m, png
+from support.layouts import CAMERA, assert_same_pose
 
 from mapless.depth import DepthSensor
 from mapless_tools.ingest.depth_options import DepthOptions
 from mapless_tools.ingest.formats import ReadOptions, read_dataset
+from mapless_tools.ingest.formats.colmap.depth_maps import MAX_PIXELS
 
 ALL = pytest.mark.parametrize("layout", LAYOUTS)
 
@@ -110,3 +111,81 @@ def test_icl_photographs_without_a_pose_are_refused(tmp_path: Path) -> None:
     file.write_text(file.read_text().splitlines()[0] + "\n")
     dataset = read_dataset(folder)
     assert (len(dataset.frames), len(dataset.refused)) == (1, 1)
+
+
+def test_large_maps_of_colmap_are_reduced(tmp_path: Path) -> None:
+    """Values stay those of the pixels in the middle of the new ones, to half a pixel."""
+    folder = LAYOUTS["colmap"](tmp_path)
+    large = CAMERA.resized(1440, 960)
+    depth_file(folder).write_bytes(colmap_map(planted_depth_m(large)))
+    depth = read_dataset(folder).frames[0].depth
+    assert depth is not None
+    image = depth.read()
+    assert image.size is not None
+    width, height = image.size
+    assert 0.98 * MAX_PIXELS < width * height <= MAX_PIXELS
+    values = np.frombuffer(image.data, "<f4").reshape(height, width)
+    np.testing.assert_allclose(values, planted_depth_m(CAMERA.resized(width, height)), rtol=0.003)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "does not begin"),
+        (b"48x32x1x", "does not begin"),
+        (b"48&32&3&" + bytes(3 * 4 * 48 * 32), "3 channels"),
+        (b"48&32&1&" + bytes(100), "100 bytes are there"),
+        (b"0&0&1&", "0x0 values"),
+        (b"999999&999999&1&", "999999x999999 values"),
+        (b"48&32&1&" + np.full((32, 48), np.nan, "<f4").tobytes(), "no pixel"),
+        (b"48&32&1&" + np.full((32, 48), -1.0, "<f4").tobytes(), "below 0"),
+    ],
+)
+def test_what_is_no_map_of_colmap_is_left_out(tmp_path: Path, content: bytes, said: str) -> None:
+    folder = LAYOUTS["colmap"](tmp_path)
+    depth_file(folder).write_bytes(content)
+    dataset = read_dataset(folder)
+    assert dataset.frames[0].depth is None
+    assert any(said in note for note in dataset.notes)
+
+
+def test_colmaps_library_writes_what_we_read(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    folder = LAYOUTS["colmap"](tmp_path)
+    depth = planted_depth_m(CAMERA.resized(48, 32)).astype(np.float32)
+    depth[0, 0] = 0
+    pycolmap.DepthMap.from_array(depth, 0.1, 10.0).write(depth_file(folder))
+    assert_planted(read_dataset(folder).frames[0])
+
+
+@pytest.mark.parametrize(
+    ("table", "line", "said"),
+    [
+        ("records_depth", "noon, reg, 0.depth.reg", "noon"),
+        ("records_depth", "0, other, 0.depth.reg", "no depth sensor"),
+        ("records_depth", "0, reg, ../../0.depth.reg", "leads out of"),
+        ("records_depth", "0, reg, 1.depth.reg", "there is no file"),
+        ("sensors", "reg, , depth, EUCM, 96, 64, 80, 81, 48, 32, 0.5, 1", "EUCM"),
+        ("rigs", "rig, other, 1, 0, 0, 0, 0, 0, 0", "has none of 'reg'"),
+    ],
+)
+def test_kaptures_that_contradict_themselves_lose_the_depth(tmp_path: Path, table: str, line: str, said: str) -> None:
+    folder = LAYOUTS["kapture"](tmp_path)
+    for name in ("records_depth", table):
+        file = folder / "sensors" / f"{name}.txt"
+        kept = [it for it in file.read_text().splitlines() if "raw" not in it or name == "sensors"]
+        if name == table:
+            kept = [*(it for it in kept if "reg" not in it), line]
+        file.write_text("\n".join(kept) + "\n")
+    dataset = read_dataset(folder)
+    assert [frame.depth for frame in dataset.frames] == [None, None]
+    assert any(said in note for note in dataset.notes), dataset.notes
+
+
+def test_of_several_depths_of_kapture_the_nearest_is_taken(tmp_path: Path) -> None:
+    folder = LAYOUTS["kapture"](tmp_path)
+    assert depth_file(folder).name == "0.depth.reg"
+    records = folder / "sensors" / "records_depth.txt"
+    records.write_text("0, raw, 0.depth\n")
+    assert depth_file(folder).name == "0.depth"
+    assert_planted(read_dataset(folder).frames[0])

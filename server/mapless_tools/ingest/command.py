@@ -195,6 +195,9 @@ def export_command(
             export = export_scene(client, scene, folder, format, progress)
     for reason in export.damaged.values():
         print(f"skipped: {reason}", file=sys.stderr)
+    if export.without_depth:
+        count = export.without_depth
+        print(f"note: {format} has no depth, that of {count} references is not written", file=sys.stderr)
     where = f"references of scene {scene} are in {folder}"
     if export.damaged:
         count = len(export.damaged)

@@ -3,19 +3,22 @@
 It can also rescue a damaged store: undamaged references are written.
 """
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from mapless import Client, DepthImage, Reference
+import numpy as np
+
+from mapless import Client, Reference
 from mapless.masks import FOLDER as MASKS
 from mapless.masks import mask_name
+from mapless_server.images import ImageLimits, decode_depth
 from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 
 from .fetching import Export, fetch_all
+from .formats.depths import FLOAT32, WrittenDepth
 from .formats.depths import FOLDER as DEPTHS
-from .formats.depths import confidence_name, depth_entry, depth_name
-from .formats.writing import LAYOUTS, PosedImage, image_name
+from .formats.writing import LAYOUTS, DepthForm, Layout, PosedImage, image_name
 
 FORMATS = (*LAYOUTS, "gltf")
 
@@ -34,9 +37,9 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
     """Writes a scene's references into a folder, except damaged ones.
 
     ValueError as in `check_target`, or without references. The layouts `cameras` and `kapture` also have the scene's
-    datum, down and unit. Masks are written to masks/, under COLMAP's names, and depths to depth/, which the layout
-    `cameras` alone describes. A calibration is not exported, since it holds for this server version only; a backup
-    keeps it.
+    datum, down and unit, and depths: `cameras` as they came, kapture in metres. A model of COLMAP has none. Masks are
+    written to masks/, under COLMAP's names. A calibration is not exported, since it holds for this server version only;
+    a backup keeps it.
 
     The description is written last, so a folder without it is an interrupted export. If every reference is damaged,
     nothing is left in the folder.
@@ -48,6 +51,7 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
         return export_gltf(client, scene, folder, progress)
     written = LAYOUTS[layout]
     place = folder / written.images
+    left_out: list[str] = []
 
     def take(reference: Reference) -> PosedImage:
         image = reference.image or b""
@@ -55,8 +59,9 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
         _write(place / name, image)
         if reference.mask is not None:
             _write(folder / MASKS / mask_name(name), reference.mask)
-        depth = {} if reference.depth is None else _write_depth(folder / DEPTHS, name, reference.depth)
-        has_mask = reference.mask is not None
+        depth, has_mask = _write_depth(folder, written, name, reference), reference.mask is not None
+        if depth is None and reference.depth is not None:
+            left_out.append(name)
         return PosedImage(name, reference.camera, reference.world_from_camera, has_mask, reference.provenance, depth)
 
     known = client.get_scene(scene)
@@ -66,16 +71,26 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             with whole_file(folder / path) as file:
                 file.write_text(text, encoding="utf-8")
-    return Export(len(images), damaged)
+    return Export(len(images), damaged, len(left_out))
 
 
-def _write_depth(folder: Path, image: str, depth: DepthImage) -> dict[str, Any]:
-    """Writes the depth of an image; returns its entries in `cameras.json`."""
-    name = depth_name(image, depth)
-    _write(folder / name, depth.data)
-    if depth.confidence:
-        _write(folder / confidence_name(name), depth.confidence)
-    return depth_entry(depth, name)
+def _write_depth(folder: Path, layout: Layout, image: str, reference: Reference) -> WrittenDepth | None:
+    """Writes the depth of a reference, if it has one, in the form that the layout has."""
+    depth = reference.depth
+    if depth is None or layout.depths is DepthForm.NONE:
+        return None
+    if layout.depths is DepthForm.METRES:
+        path = f"{image}.depth"
+        values = decode_depth(depth, (reference.camera.width_px, reference.camera.height_px), ImageLimits())
+        _write(folder / layout.images / path, np.nan_to_num(values).astype("<f4").tobytes())
+        height, width = values.shape
+        return WrittenDepth(path, replace(depth, data=b"", unit_m=1.0, size=(width, height), confidence=b""))
+    path = f"{DEPTHS}/{image}{'.png' if depth.size is None else FLOAT32}"
+    confidence = f"{path}.confidence.png" if depth.confidence else ""
+    _write(folder / path, depth.data)
+    if confidence:
+        _write(folder / confidence, depth.confidence)
+    return WrittenDepth(path, replace(depth, data=b"", confidence=b""), confidence)
 
 
 def _write(path: Path, data: bytes) -> None:

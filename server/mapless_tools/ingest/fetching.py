@@ -17,10 +17,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Export:
-    """The number of written references, and the server's messages about damaged ones by their ids, in their order."""
+    """The number of written references, and the server's messages about damaged ones by their ids, in their order.
+
+    `without_depth` is the number of those whose depth the layout cannot have.
+    """
 
     written: int
     damaged: Mapping[str, str]
+    without_depth: int = 0
 
     @property
     def total(self) -> int:

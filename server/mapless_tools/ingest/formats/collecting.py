@@ -87,6 +87,8 @@ class ReadOptions:
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 """Camera axes x right, y up, z back to x right, y down, z forward; its own inverse."""
+UNUSABLE = (InvalidArgument, OSError, ValueError)
+"""Errors of a depth's file, or of what it holds."""
 _HEAD_BYTES = 2**16
 
 
@@ -111,6 +113,14 @@ class Collector:
             yield
         except ValueError as error:
             self.refused.append(Refusal(frame, str(error)))
+
+    @contextmanager
+    def attempt_depth(self, depth: str) -> Iterator[None]:
+        """Leaves the depth out, with a note, if the block raises an error of its file or of what it holds."""
+        try:
+            yield
+        except UNUSABLE as error:
+            self.leave_out_depth(depth, error)
 
     def leave_out_depth(self, depth: str, error: Exception) -> None:
         """Notes that a depth cannot be used."""
@@ -152,18 +162,19 @@ class Collector:
         self._ids.add(identifier)
         self._images.add(file)
 
-    def depth(self, depth: DepthFile, photo: tuple[int, int]) -> DepthFile | None:
+    def depth(self, depth: DepthFile, photo: tuple[int, int], folder: Path | None = None) -> DepthFile | None:
         """The depth of a frame of this size, (width, height) pixels; None, and a note, if it cannot be used.
 
-        Its paths are from the folder, as the layout has them.
+        Its paths are from a folder, by default that of the images.
         """
+        folder = folder or self.folder
         if self.depths.no_depth:
             return None
         try:
-            confidence = depth.confidence_path and path_in(self.folder, str(depth.confidence_path))
-            found = replace(depth, path=path_in(self.folder, str(depth.path)), confidence_path=confidence)
+            confidence = depth.confidence_path and path_in(folder, str(depth.confidence_path))
+            found = replace(depth, path=path_in(folder, str(depth.path)), confidence_path=confidence)
             decode_depth(found.read(), photo, ImageLimits())
-        except (InvalidArgument, OSError, ValueError) as error:
+        except UNUSABLE as error:
             self.leave_out_depth(str(depth.path), error)
             return None
         return found

@@ -8,7 +8,7 @@ where that is elsewhere, and ``depth_confidence`` (path of a PNG of 8 bits) with
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,20 @@ from mapless_tools.dataset import DepthFile, finite_numbers, named, path_in
 FOLDER = "depth"
 """Where exports put them."""
 FLOAT32 = ".f32"
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenDepth:
+    """The depth of an image in a layout's file of this path; `image` has no values, and of these the size.
+
+    `confidence` is the path of its confidence, empty without one.
+    """
+
+    path: str
+    image: DepthImage
+    confidence: str = ""
+
+
 _OF_CAMERA = ("width", "height", "K", "dist", "lens")
 
 
@@ -49,9 +63,10 @@ def depth_of_frame(folder: Path, entry: Mapping[str, Any], beside: Mapping[str, 
     )
 
 
-def depth_entry(depth: DepthImage, name: str) -> dict[str, Any]:
-    """The entries of a frame for a depth that is stored under this name in `FOLDER`; see `depth_name`."""
-    entry: dict[str, Any] = {"depth": f"{FOLDER}/{name}", "depth_unit_m": depth.unit_m}
+def depth_entry(written: WrittenDepth) -> dict[str, Any]:
+    """The entries of a frame for its depth."""
+    depth = written.image
+    entry: dict[str, Any] = {"depth": written.path, "depth_unit_m": depth.unit_m}
     entry["depth_sensor"] = depth.sensor.value
     if depth.size is not None:
         entry["depth_width"], entry["depth_height"] = depth.size
@@ -59,21 +74,11 @@ def depth_entry(depth: DepthImage, name: str) -> dict[str, Any]:
         entry |= {f"depth_{field}": value for field, value in _camera_entry(depth.camera).items()}
     if depth.camera_from_depth_camera is not None:
         entry["camera_from_depth_camera"] = depth.camera_from_depth_camera.matrix().tolist()
-    if depth.confidence:
-        entry |= {"depth_confidence": f"{FOLDER}/{confidence_name(name)}", "depth_min_confidence": depth.min_confidence}
+    if written.confidence:
+        entry |= {"depth_confidence": written.confidence, "depth_min_confidence": depth.min_confidence}
     if depth.noise is not None:
         entry["depth_noise"] = asdict(depth.noise)
     return entry
-
-
-def depth_name(image: str, depth: DepthImage) -> str:
-    """File name of the depth of an image."""
-    return image + (".png" if depth.size is None else FLOAT32)
-
-
-def confidence_name(name: str) -> str:
-    """File name of the confidence of a depth, from the depth's."""
-    return f"{name}.confidence.png"
 
 
 def _read(said: Mapping[str, Any], field: str, read: Callable[[Any], Any]) -> Any:

@@ -3,7 +3,11 @@
 kapture: `sensors/sensors.txt` (id, name, type, model, width, height, parameters), `sensors/trajectories.txt`
 (timestamp, device, qw qx qy qz tx ty tz of device_from_world), `sensors/rigs.txt` (rig, device, sensor_from_rig; rigs
 may hold rigs), `sensors/records_camera.txt` (timestamp, sensor, path in `sensors/records_data`). Camera models, axes
-and the corner from which principal points count are COLMAP's. All else, such as depth maps, is ignored.
+and the corner from which principal points count are COLMAP's. `sensors/records_depth.txt` (timestamp, sensor, path in
+`sensors/records_data`) has depths: float32 metres, little-endian, row by row, 0 where there is none, of sensors of the
+type depth, which have a camera's parameters. A photograph's depth has its timestamp; of several, such as a raw one and
+one that is registered to the photograph, it is that of the nearest sensor. All else is ignored. (kapture's
+kapture_format, and the tools of its library that write depths.)
 
 Capture: a session's folder with `sensors.txt`, `rigs.txt` (rig_from_sensor), `trajectories.txt` (world_from_device),
 `images.txt` (paths in `raw_data`), and perhaps `proc/alignment_trajectories.txt`, which has the poses in the world that
@@ -18,9 +22,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from mapless.geometry import RigidTransform
+import numpy as np
+
+from mapless.depth import DepthSensor
+from mapless.geometry import Camera, RigidTransform
 from mapless.masks import FOLDER as MASKS
-from mapless_tools.dataset import Dataset, finite_numbers, read_place
+from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, read_place
 
 from .collecting import Collector, ReadOptions, filled_lines, rotation_of, text_lines
 from .colmap.cameras import PARAMETERS, ColmapCamera
@@ -28,6 +35,7 @@ from .masks import with_own_masks
 
 PROPERTIES = "# mapless: "
 """Begins a comment of our own exports in sensors.txt: what kapture has no field for, as JSON."""
+_SENSORS = {it.value for it in DepthSensor}
 _MAX_NESTED = 10  # rigs in rigs, as kapture's own library
 
 
@@ -54,13 +62,15 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         trajectories = aligned
         collector.notes.append(f"poses are those of {aligned.relative_to(path)}, in the world of all sessions")
     properties = _properties(tables / "sensors.txt")
-    cameras = _cameras(tables / "sensors.txt")
+    cameras = _cameras(tables / "sensors.txt", "camera")
     poses = _Poses(trajectories, tables / "rigs.txt", is_capture)
+    depths = _Depths(collector, tables, poses)
     for place, (timestamp, sensor, image) in _rows(records, 3):
         with collector.attempt(f"{place} ({image})"):
             if sensor not in cameras:
                 raise ValueError(f"sensor {sensor!r} is no camera of sensors.txt")
-            collector.add(image, cameras[sensor].camera(), poses.world_from_device(timestamp, sensor))
+            camera, pose = cameras[sensor].camera(), poses.world_from_device(timestamp, sensor)
+            collector.add(image, camera, pose, depth=depths.at(timestamp, camera, pose))
     is_metric = is_capture or bool(properties.get("metric", False))
     dataset = collector.dataset(path.resolve().name, "kapture", metric=is_metric, source=f"kapture {path.name}")
     dataset = with_own_masks(dataset, collector.folder, path / MASKS)  # of our own exports
@@ -82,11 +92,11 @@ def _properties(file: Path) -> dict[str, Any]:
     return {}
 
 
-def _cameras(file: Path) -> dict[str, ColmapCamera]:
-    """Reads the cameras by id; a camera of an unknown model is refused only with its images."""
+def _cameras(file: Path, wanted_kind: str) -> dict[str, ColmapCamera]:
+    """Reads the sensors of a kind by id; a camera of an unknown model is refused only with its images."""
     cameras = {}
     for place, (sensor, _, kind, *parameters) in _rows(file, 3):
-        if kind != "camera":
+        if kind != wanted_kind:
             continue
         if len(parameters) < 3:
             raise ValueError(f"{place}: a camera has a model, width and height, found {len(parameters)} parameters")
@@ -150,6 +160,47 @@ class _Poses:
                 if world_from_rig is not None:
                     return world_from_rig.compose(mount.pose())
         return None
+
+
+class _Depths:
+    """Depths by their time; none without records of them."""
+
+    def __init__(self, collector: Collector, tables: Path, poses: _Poses) -> None:
+        self._collector, self._poses = collector, poses
+        self._paths: dict[int, list[tuple[str, str]]] = {}
+        file, sensors = tables / "records_depth.txt", tables / "sensors.txt"
+        if collector.depths.no_depth or not file.is_file():
+            return
+        self._cameras = _cameras(sensors, "depth")
+        self._names = {sensor: name for _, (sensor, name, *_) in _rows(sensors, 3)}
+        for place, (timestamp, sensor, path, *_) in _rows(file, 3):
+            with collector.attempt_depth(path):
+                self._paths.setdefault(_whole(timestamp, place), []).append((sensor, path))
+
+    def at(self, timestamp: str, photo: Camera, world_from_camera: RigidTransform) -> DepthFile | None:
+        """The depth of a photograph of this time, camera and pose."""
+        found: list[DepthFile] = []
+        for sensor, path in self._paths.get(_whole(timestamp, "timestamp"), ()):
+            with self._collector.attempt_depth(path):
+                found.append(self._depth(timestamp, sensor, path, world_from_camera))
+        if not found:
+            return None
+        return self._collector.depth(min(found, key=_apart_m), (photo.width_px, photo.height_px))
+
+    def _depth(self, timestamp: str, sensor: str, path: str, world_from_camera: RigidTransform) -> DepthFile:
+        if sensor not in self._cameras:
+            raise ValueError(f"sensor {sensor!r} is no depth sensor of sensors.txt")
+        world_from_sensor = self._poses.world_from_device(timestamp, sensor)
+        camera_from_sensor = world_from_camera.inverse().compose(world_from_sensor)
+        camera, name = self._cameras[sensor].camera(), self._names[sensor]
+        kind = DepthSensor(name) if name in _SENSORS else DepthSensor.UNKNOWN  # of our own exports
+        size = camera.width_px, camera.height_px
+        return DepthFile(Path(path), 1.0, kind, camera, camera_from_sensor, size=size)
+
+
+def _apart_m(depth: DepthFile) -> float:
+    pose = depth.camera_from_depth_camera
+    return 0.0 if pose is None else float(np.linalg.norm(pose.translation))
 
 
 def _whole(text: str, what: str) -> int:

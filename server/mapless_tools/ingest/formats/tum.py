@@ -81,13 +81,11 @@ class _Depths:
             self._add(f"{file.name}:{number}", words)
 
     def _add(self, line: str, words: list[str]) -> None:
-        try:
+        with self._collector.attempt_depth(line):
             if len(words) != 2:
                 raise ValueError(f"expected a time and a path, found {len(words)} words")
             self._times_s.append(float(finite_numbers(words[0], "time")))
             self._paths.append(words[1])
-        except ValueError as error:
-            self._collector.leave_out_depth(line, error)
 
     def at(self, time_s: float, photo: tuple[int, int]) -> DepthFile | None:
         """The depth nearest to a time, of a photograph of this size; None if none within `MAX_GAP_S` can be used."""

@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 from mapless import Scene
@@ -14,6 +15,7 @@ from mapless.masks import mask_name
 from mapless.provenance import GIVEN_POSE, Provenance, provenance_to_json
 
 from .colmap.cameras import from_camera
+from .depths import WrittenDepth, depth_entry
 from .kapture import PROPERTIES
 
 IMAGES = "images"
@@ -24,7 +26,8 @@ class PosedImage:
     """An image that is stored under `name` in the layout's folder of images, with its camera and pose.
 
     If it `has_mask`, that is stored in the folder `mapless.masks.FOLDER` under COLMAP's name. `provenance` says how the
-    pose is known, and `depth` has the entries of its depth (see `depths`); only `cameras.json` has them.
+    pose is known; only `cameras.json` has it. `depth` is in the layout's form, None without one or in a layout that has
+    none.
     """
 
     name: str
@@ -32,19 +35,28 @@ class PosedImage:
     world_from_camera: RigidTransform
     has_mask: bool = False
     provenance: Provenance = GIVEN_POSE
-    depth: Mapping[str, Any] = field(default_factory=dict)
+    depth: WrittenDepth | None = None
 
 
 Describe = Callable[..., dict[str, str]]
 """Returns a layout's files by their paths: of images, their origin as a text, and perhaps their scene."""
 
 
+class DepthForm(Enum):
+    """How depths are written: not at all, as they came, or as values in metres of those that are used."""
+
+    NONE = "none"
+    AS_STORED = "as stored"
+    METRES = "metres"
+
+
 @dataclass(frozen=True)
 class Layout:
-    """A layout that can be written: its function that describes images, and the folder of the images."""
+    """A layout that can be written: its function that describes images, the folder of the images, and how depth is."""
 
     files: Describe
     images: str = IMAGES
+    depths: DepthForm = DepthForm.NONE
 
 
 def _properties(scene: Scene | None) -> dict[str, Any]:
@@ -89,28 +101,59 @@ def model_texts(images: Sequence[PosedImage]) -> dict[str, str]:
 def kapture_files(images: Sequence[PosedImage], source: str, scene: Scene | None = None) -> dict[str, str]:
     """The tables of a kapture 1.1; each image has its own time, and images with equal cameras share one."""
     sensors: dict[Camera, str] = {}
-    trajectories, records = [], []
+    trajectories, records, depths = [], [], _DepthTables()
     for time, image in enumerate(images):
         sensor = sensors.setdefault(image.camera, f"camera{len(sensors) + 1}")
         trajectories.append(f"{time}, {sensor}, {_camera_from_world(image, ', ')}")
         records.append(f"{time}, {sensor}, {image.name}")
-    cameras = []
-    for camera, sensor in sensors.items():
-        it = from_camera(sensor, camera)
-        cameras.append(f"{sensor}, , camera, {it.model}, {it.width_px}, {it.height_px}, {_words(it.parameters, ', ')}")
+        trajectories += depths.add(time, image)
+    cameras = [_sensor_row(sensor, "", "camera", camera) for camera, sensor in sensors.items()]
     notes = [f"# {source}", f"{PROPERTIES}{json.dumps(_properties(scene))}"]
     tables = {
-        "sensors": [*notes, "# sensor_id, name, sensor_type, [sensor_params]+", *cameras],
+        "sensors": [*notes, "# sensor_id, name, sensor_type, [sensor_params]+", *cameras, *depths.sensor_rows()],
         "trajectories": ["# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz", *trajectories],
         "records_camera": ["# timestamp, device_id, image_path", *records],
     }
+    if depths.records:
+        tables["records_depth"] = ["# timestamp, device_id, depth_map_path", *depths.records]
     return {f"sensors/{name}.txt": "\n".join(["# kapture format: 1.1", *it]) + "\n" for name, it in tables.items()}
 
 
+class _DepthTables:
+    """Depth sensors of a kapture, one for each kind and camera, and the records of their depths."""
+
+    def __init__(self) -> None:
+        self.records: list[str] = []
+        self._sensors: dict[tuple[str, Camera], str] = {}
+
+    def add(self, time: int, image: PosedImage) -> list[str]:
+        """Records the depth of an image; returns the pose of its sensor as a row of trajectories, if it has one."""
+        if image.depth is None:
+            return []
+        depth = image.depth.image
+        assert depth.size is not None
+        camera = depth.camera or image.camera.resized(*depth.size)
+        sensor = self._sensors.setdefault((depth.sensor.value, camera), f"depth{len(self._sensors) + 1}")
+        self.records.append(f"{time}, {sensor}, {image.depth.path}")
+        pose = image.world_from_camera
+        if depth.camera_from_depth_camera is not None:
+            pose = pose.compose(depth.camera_from_depth_camera)
+        return [f"{time}, {sensor}, {_inverse_words(pose, ', ')}"]
+
+    def sensor_rows(self) -> list[str]:
+        """Rows of sensors.txt."""
+        return [_sensor_row(sensor, name, "depth", camera) for (name, camera), sensor in self._sensors.items()]
+
+
+def _sensor_row(sensor: str, name: str, kind: str, camera: Camera) -> str:
+    it = from_camera(sensor, camera)
+    return f"{sensor}, {name}, {kind}, {it.model}, {it.width_px}, {it.height_px}, {_words(it.parameters, ', ')}"
+
+
 LAYOUTS: Mapping[str, Layout] = {
-    "cameras": Layout(cameras_files),
+    "cameras": Layout(cameras_files, depths=DepthForm.AS_STORED),
     "colmap": Layout(colmap_files),
-    "kapture": Layout(kapture_files, "sensors/records_data"),
+    "kapture": Layout(kapture_files, "sensors/records_data", DepthForm.METRES),
 }
 """Layouts that are written, by name."""
 
@@ -136,14 +179,18 @@ def _entry(image: PosedImage) -> dict[str, Any]:
         entry["mask"] = f"{MASKS}/{mask_name(image.name)}"
     if provenance := provenance_to_json(image.provenance):
         entry["provenance"] = provenance
-    entry |= image.depth
+    entry |= {} if image.depth is None else depth_entry(image.depth)
     model = DEFAULT_LENS_MODEL if lens is None else lens_model_of(lens)
     return entry if model == DEFAULT_LENS_MODEL else entry | {"lens": model}
 
 
 def _camera_from_world(image: PosedImage, separator: str = " ") -> str:
+    return _inverse_words(image.world_from_camera, separator)
+
+
+def _inverse_words(world_from_camera: RigidTransform, separator: str) -> str:
     """The pose in the form of COLMAP and kapture: qw qx qy qz tx ty tz."""
-    pose = image.world_from_camera.inverse()
+    pose = world_from_camera.inverse()
     q = pose.quaternion()
     return _words([q.w, q.x, q.y, q.z, *pose.translation.tolist()], separator)
 

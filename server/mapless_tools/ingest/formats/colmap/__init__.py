@@ -20,6 +20,7 @@ from mapless_tools.dataset import Dataset
 from ..collecting import Collector, ReadOptions, natural_order, text_lines
 from ..masks import with_own_masks
 from .cameras import ColmapCamera
+from .depth_maps import depth_of_image, find_depths
 from .files import ImageRecord, announced, read_cameras, read_images
 
 
@@ -131,10 +132,12 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     if unknown := sorted(tests - set(model.images)):
         collector.notes.append(f"{len(unknown)} names of {queries} are no images of the model, such as {unknown[0]}")
     collector.notes += model.notes
+    depths = find_depths(path, images.parent)
     for name in sorted(model.images, key=natural_order):
         with collector.attempt(name):
             camera, pose = model.camera_and_pose(name)
-            collector.add(name, camera, pose, ("test" if name in tests else "train") if tests else "")
+            depth = depth_of_image(collector, depths, name, (camera.width_px, camera.height_px))
+            collector.add(name, camera, pose, ("test" if name in tests else "train") if tests else "", depth=depth)
     for name, reason in model.refused:
         with collector.attempt(name):
             raise ValueError(reason)
