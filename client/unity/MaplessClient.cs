@@ -199,6 +199,7 @@ namespace Mapless
         /// Deadline of the call, until which it is repeated while the server is away, stops or is lost during the answer.
         /// </param>
         /// <param name="cancellation">Ends the call earlier, on the server, too.</param>
+        /// <param name="depth">What a depth sensor measured of that raster: DepthMetres makes it; null without.</param>
         /// <exception cref="RpcException">
         /// Unavailable (until the deadline) and ResourceExhausted: try again later, with a newer photograph. Others say what
         /// is wrong.
@@ -210,7 +211,8 @@ namespace Mapless
             Pose sensorPose,
             DateTime captureTime,
             TimeSpan timeout,
-            CancellationToken cancellation = default)
+            CancellationToken cancellation = default,
+            DepthImage depth = null)
         {
             var request = new LocalizeRequest
             {
@@ -220,6 +222,7 @@ namespace Mapless
                 CaptureTime = Timestamp.FromDateTime(captureTime.ToUniversalTime()),
                 SessionFromCamera = ToMessage(sensorPose),
                 Options = new LocalizeOptions { Axes = Axes.Unity },
+                Depth = depth,
             };
             return new MaplessAnswer(await LocalizeAsync(request, timeout, cancellation).ConfigureAwait(true));
         }
@@ -650,11 +653,13 @@ namespace Mapless
         private async Task<Reference> StoredAsync(
             string scene, CreateReferenceRequest wanted, TimeSpan left, CancellationToken cancellation)
         {
-            Reference stored = await GetReferenceAsync(scene + "/references/" + wanted.ReferenceId, false, left, cancellation)
-                .ConfigureAwait(true);
+            string name = scene + "/references/" + wanted.ReferenceId;
+            bool hasDepth = wanted.Reference.Depth != null; // which comes back with the photograph only
+            Reference stored = await GetReferenceAsync(name, hasDepth, left, cancellation).ConfigureAwait(true);
             string mask = wanted.Reference.HasMask ? Sha256Of(wanted.Reference.Mask) : "";
             bool isSame = string.Equals(Sha256Of(wanted.Reference.Image), stored.ImageSha256, StringComparison.OrdinalIgnoreCase)
                 && string.Equals(mask, stored.MaskSha256, StringComparison.OrdinalIgnoreCase)
+                && (hasDepth ? IsSame(wanted.Reference.Depth, stored.Depth) : stored.DepthSha256.Length == 0)
                 && wanted.Reference.Intrinsics.Equals(stored.Intrinsics)
                 && IsSame(wanted.Reference.WorldFromCamera, stored.WorldFromCamera);
             return isSame ? stored : null;
@@ -666,6 +671,13 @@ namespace Mapless
             {
                 return BitConverter.ToString(hash.ComputeHash(bytes.ToByteArray())).Replace("-", "");
             }
+        }
+
+        private static bool IsSame(DepthImage wanted, DepthImage stored)
+        {
+            return stored != null && wanted.Png.Equals(stored.Png) && wanted.Float32.Equals(stored.Float32)
+                && wanted.UnitM.Equals(stored.UnitM) && wanted.Sensor == stored.Sensor
+                && wanted.Confidence.Equals(stored.Confidence);
         }
 
         private static bool IsSame(CreateSceneRequest wanted, Scene stored)
@@ -750,6 +762,52 @@ namespace Mapless
                 name,
                 Marshallers.Create(message => message.ToByteArray(), requests.ParseFrom),
                 Marshallers.Create(message => message.ToByteArray(), responses.ParseFrom));
+        }
+
+        /// <summary>
+        /// Depth in metres for LocalizeRequest.Depth and Reference.Depth, of the photograph's camera, scaled, row by row; 0, NaN
+        /// and infinity are no value. The rows of a Texture2D begin at the bottom, those of an XRCpuImage at the top.
+        /// </summary>
+        /// <exception cref="ArgumentException">There are not width times height values.</exception>
+        public static DepthImage DepthMetres(
+            float[] metres, int width, int height, DepthSensor sensor = DepthSensor.PhoneLidar, bool bottomRowFirst = false)
+        {
+            if (width < 1 || height < 1 || metres.Length != width * height)
+            {
+                throw new ArgumentException($"a depth of {width}x{height} cannot have {metres.Length} values");
+            }
+            int rowBytes = 4 * width;
+            var bytes = new byte[rowBytes * height];
+            for (int row = 0; row < height; row++)
+            {
+                int from = bottomRowFirst ? height - 1 - row : row;
+                Buffer.BlockCopy(metres, rowBytes * from, bytes, rowBytes * row, rowBytes);
+            }
+            return new DepthImage
+            {
+                Float32 = ByteString.CopyFrom(bytes), WidthPx = width, HeightPx = height, UnitM = 1, Sensor = sensor,
+            };
+        }
+
+        /// <summary>
+        /// Metres of the plane of an XRCpuImage, as AROcclusionManager gives it: DepthFloat32 (ARKit) or DepthUint16 (ARCore),
+        /// which is millimetres.
+        /// </summary>
+        /// <exception cref="ArgumentException">The plane has fewer bytes than its rows need.</exception>
+        public static float[] DepthPlane(byte[] plane, int rowStride, int width, int height, bool isFloat32)
+        {
+            int size = isFloat32 ? 4 : 2;
+            if (rowStride < size * width || plane.Length < rowStride * (height - 1) + size * width)
+            {
+                throw new ArgumentException($"a depth of {width}x{height} with rows of {rowStride} bytes cannot have {plane.Length} bytes");
+            }
+            var metres = new float[width * height];
+            for (int i = 0; i < metres.Length; i++)
+            {
+                int at = rowStride * (i / width) + size * (i % width);
+                metres[i] = isFloat32 ? BitConverter.ToSingle(plane, at) : BitConverter.ToUInt16(plane, at) / 1000f;
+            }
+            return metres;
         }
 
         /// <summary>

@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mapless.v1 import geometry_pb2, localization_service_pb2, reference_service_pb2
@@ -116,7 +117,59 @@ def part(begin: str, end: str) -> str:
     return SOURCE[start : SOURCE.index(end, start) + len(end)]
 
 
-@pytest.mark.skipif(not (shutil.which("mcs") and shutil.which("mono")), reason="needs mono-mcs and mono-runtime")
+needs_mono = pytest.mark.skipif(
+    not (shutil.which("mcs") and shutil.which("mono")), reason="needs mono-mcs and mono-runtime"
+)
+
+
+def printed(tmp_path: Path, source: str) -> list[str]:
+    """The words that a program prints."""
+    (tmp_path / "parts.cs").write_text(source)
+    program = tmp_path / "parts.exe"
+    command = ["mcs", "-langversion:7.2", f"-out:{program}", str(tmp_path / "parts.cs")]
+    subprocess.run(command, check=True, timeout=120)
+    return subprocess.run(
+        ["mono", str(program)], check=True, capture_output=True, text=True, timeout=120
+    ).stdout.split()
+
+
+_DEPTH = """
+using System;
+enum DepthSensor { PhoneLidar }
+class ByteString { public byte[] B; public static ByteString CopyFrom(byte[] b) { return new ByteString { B = b }; } }
+class DepthImage {
+  public ByteString Float32; public int WidthPx, HeightPx; public double UnitM; public DepthSensor Sensor;
+}
+class Program {
+  PARTS
+  static void Show(DepthImage depth) { Console.WriteLine(BitConverter.ToString(depth.Float32.B)); }
+  static void Main() {
+    var millimetres = new byte[] { 0xE8, 0x03, 0, 0, 99, 99, 0xF4, 0x01, 0xD0, 0x07, 99, 99 };
+    float[] metres = DepthPlane(millimetres, 6, 2, 2, false);
+    Show(DepthMetres(metres, 2, 2));
+    Show(DepthMetres(metres, 2, 2, DepthSensor.PhoneLidar, true));
+    var plane = new byte[16];
+    Buffer.BlockCopy(metres, 0, plane, 0, 16);
+    Show(DepthMetres(DepthPlane(plane, 8, 2, 2, true), 2, 2));
+    foreach (Action wrong in new Action[] { () => DepthMetres(metres, 2, 3), () => DepthPlane(plane, 8, 2, 3, true) }) {
+      try { wrong(); } catch (ArgumentException) { Console.WriteLine("refused"); }
+    }
+  }
+}
+"""
+
+
+@needs_mono
+def test_depth_is_sent_as_float_metres(tmp_path: Path) -> None:
+    """Of ARCore's millimetres with padded rows, of a texture whose bottom row is first, of ARKit's metres."""
+    declared = ("public static DepthImage DepthMetres", "public static float[] DepthPlane")
+    found = printed(tmp_path, _DEPTH.replace("PARTS", "\n".join(part(it, "\n        }\n") for it in declared)))
+    top, bottom = np.array([1.0, 0.0], "<f4"), np.array([0.5, 2.0], "<f4")
+    upright = (top.tobytes() + bottom.tobytes()).hex("-").upper()
+    assert found == [upright, (bottom.tobytes() + top.tobytes()).hex("-").upper(), upright, "refused", "refused"]
+
+
+@needs_mono
 def test_a_call_that_reached_no_server_is_not_done(tmp_path: Path) -> None:
     """And no proxy is used for this machine."""
     parts = [
@@ -125,11 +178,7 @@ def test_a_call_that_reached_no_server_is_not_done(tmp_path: Path) -> None:
         part("private static readonly string[] UnconnectedSigns", "};"),
         part("private static void UseNoProxy", "\n        }\n"),
     ]
-    (tmp_path / "parts.cs").write_text(_STAND_INS.replace("PARTS", "\n".join(parts)))
-    program = tmp_path / "parts.exe"
-    command = ["mcs", "-langversion:7.2", f"-out:{program}", str(tmp_path / "parts.cs")]
-    subprocess.run(command, check=True, timeout=120)
-    ran = subprocess.run(["mono", str(program)], check=True, capture_output=True, text=True, timeout=120)
-    assert ran.stdout.split() == ["True", "True", "True", "False", "False", "False", "False"]
+    found = printed(tmp_path, _STAND_INS.replace("PARTS", "\n".join(parts)))
+    assert found == ["True", "True", "True", "False", "False", "False", "False"]
     assert "MayBeDone |= pauseS < leftS && !IsUnsent(error);" in SOURCE
     assert "new Uri(one).IsLoopback" in SOURCE

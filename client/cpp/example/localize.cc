@@ -1,5 +1,6 @@
-// Localizes a photograph: localize ADDRESS SCENE PHOTO WIDTH HEIGHT FX FY CX CY. MAPLESS_TOKEN has the token, MAPLESS_CA the file of
-// the authority that signed the server's certificate; with it the connection is encrypted.
+// Localizes a photograph: localize ADDRESS SCENE PHOTO WIDTH HEIGHT FX FY CX CY [DEPTH [UNIT_M]], with the PNG of 16 bits of a depth
+// camera that is aligned with it, millimetres unless UNIT_M says another. MAPLESS_TOKEN has the token, MAPLESS_CA the file of the
+// authority that signed the server's certificate; with it the connection is encrypted.
 //
 // Exit codes as those of the command `mapless`: 0 localized, 1 the call failed, 2 wrong usage, 3 not localized.
 #include <mapless/client.h>
@@ -18,7 +19,7 @@ void Print(const mapless::v1::LocalizeResponse& answer) {
   std::printf("\nrotation  x %.4f y %.4f z %.4f w %.4f\n", q.x(), q.y(), q.z(), q.w());
 }
 
-int Run(char** arguments) {
+int Run(int count, char** arguments) {
   mapless::ConnectOptions options;
   options.address = arguments[1];
   options.connect_timeout = std::chrono::seconds(2);  // for a person, who may have mistyped it
@@ -36,6 +37,8 @@ int Run(char** arguments) {
   for (int i = 0; i < 6; ++i) numbers[i] = std::stod(arguments[4 + i]);
   *request.mutable_intrinsics() = mapless::Pinhole(static_cast<int>(numbers[0]), static_cast<int>(numbers[1]), numbers[2],
                                                    numbers[3], numbers[4], numbers[5]);
+  if (count > 10)
+    *request.mutable_depth() = mapless::DepthPng(mapless::ReadFile(arguments[10]), count > 11 ? std::stod(arguments[11]) : 0.001);
   const auto answer = client.LocalizeProgressively(request, [](const mapless::v1::LocalizeResponse& better) {
     std::puts("localized; the final answer follows");
     Print(better);
@@ -47,18 +50,19 @@ int Run(char** arguments) {
   }
   std::printf("localized, %d of %d matches agree\n", answer.localization().inlier_count(), answer.localization().match_count());
   Print(answer);
+  if (count > 10 && !answer.diagnostics().has_depth_check()) std::puts("the server is older than depth, and has ignored it");
   return 0;
 }
 
 }  // namespace
 
 int main(int count, char** arguments) {
-  if (count != 10) {
-    std::fprintf(stderr, "usage: localize ADDRESS SCENE PHOTO WIDTH HEIGHT FX FY CX CY\n");
+  if (count < 10 || count > 12) {
+    std::fprintf(stderr, "usage: localize ADDRESS SCENE PHOTO WIDTH HEIGHT FX FY CX CY [DEPTH [UNIT_M]]\n");
     return 2;
   }
   try {
-    return Run(arguments);
+    return Run(count, arguments);
   } catch (const mapless::Unavailable& error) {
     std::fprintf(stderr, "the server cannot be reached: %s\n", error.message.c_str());
     return 1;

@@ -1,6 +1,8 @@
 #include "mapless/client.h"
 
 #include <algorithm>
+#include <cstdint>
+#include <cstring>
 #include <fstream>
 #include <future>
 #include <iterator>
@@ -274,6 +276,7 @@ bool Client::Stored(const std::string& scene, const v1::CreateReferenceRequest& 
   const bool is_same = IsSame(wanted.reference(), stored);
   stored.clear_image();
   stored.clear_mask();
+  stored.clear_depth();
   return is_same;
 }
 
@@ -361,6 +364,35 @@ v1::CameraIntrinsics Pinhole(int width_px, int height_px, double focal_x_px, dou
   camera.set_principal_x_px(principal_x_px);
   camera.set_principal_y_px(principal_y_px);
   return camera;
+}
+
+v1::DepthImage DepthPng(std::string png, double unit_m, v1::DepthSensor sensor) {
+  v1::DepthImage depth;
+  depth.set_png(std::move(png));
+  depth.set_unit_m(unit_m);
+  depth.set_sensor(sensor);
+  return depth;
+}
+
+v1::DepthImage DepthMetres(const std::vector<float>& metres, int width_px, int height_px, v1::DepthSensor sensor) {
+  static_assert(sizeof(float) == 4, "the interface has floats of 4 bytes");
+  if (width_px < 1 || height_px < 1 || metres.size() != static_cast<std::size_t>(width_px) * static_cast<std::size_t>(height_px))
+    throw std::invalid_argument("a depth of " + std::to_string(width_px) + "x" + std::to_string(height_px) + " cannot have " +
+                                std::to_string(metres.size()) + " values");
+  std::string bytes;
+  bytes.reserve(4 * metres.size());
+  for (const float value : metres) {  // little-endian on any machine
+    std::uint32_t bits = 0;
+    std::memcpy(&bits, &value, sizeof bits);
+    for (int shift = 0; shift < 32; shift += 8) bytes.push_back(static_cast<char>(bits >> shift & 0xff));
+  }
+  v1::DepthImage depth;
+  depth.set_float32(std::move(bytes));
+  depth.set_width_px(width_px);
+  depth.set_height_px(height_px);
+  depth.set_unit_m(1);
+  depth.set_sensor(sensor);
+  return depth;
 }
 
 v1::RigidTransform Pose(double qx, double qy, double qz, double qw, double x_m, double y_m, double z_m) {

@@ -37,6 +37,13 @@ bool SameDatum(const v1::Datum& a, const v1::Datum& b) {
          Near(a.height_m(), b.height_m()) && SameRotation(RotationOf(a), RotationOf(b));
 }
 
+// Values, unit, sensor and confidence; a camera of its own comes back with the same numbers, its pose normalized.
+bool SameDepth(const v1::DepthImage& a, const v1::DepthImage& b) {
+  return a.png() == b.png() && a.float32() == b.float32() && a.unit_m() == b.unit_m() && a.sensor() == b.sensor() &&
+         a.confidence() == b.confidence() && a.has_intrinsics() == b.has_intrinsics() &&
+         google::protobuf::util::MessageDifferencer::Equals(a.intrinsics(), b.intrinsics());
+}
+
 }  // namespace
 
 bool IsSame(const v1::CreateSceneRequest& wanted, const v1::Scene& stored) {
@@ -49,6 +56,7 @@ bool IsSame(const v1::CreateSceneRequest& wanted, const v1::Scene& stored) {
 bool IsSame(const v1::Reference& wanted, const v1::Reference& stored) {
   const auto &a = wanted.world_from_camera(), &b = stored.world_from_camera();
   return wanted.image() == stored.image() && wanted.has_mask() == stored.has_mask() && wanted.mask() == stored.mask() &&
+         wanted.has_depth() == stored.has_depth() && SameDepth(wanted.depth(), stored.depth()) &&
          google::protobuf::util::MessageDifferencer::Equals(wanted.intrinsics(), stored.intrinsics()) &&
          SameRotation(a.rotation(), b.rotation()) && Near(a.translation_m().x(), b.translation_m().x()) &&
          Near(a.translation_m().y(), b.translation_m().y()) && Near(a.translation_m().z(), b.translation_m().z());

@@ -7,7 +7,7 @@ namespace mapless {
 
 // A scene as it was to be created, unchanged since.
 bool IsSame(const v1::CreateSceneRequest& wanted, const v1::Scene& stored);
-// A reference with its photograph and mask: the same bytes, camera and pose.
+// A reference with its photograph, mask and depth: the same bytes, camera and pose.
 bool IsSame(const v1::Reference& wanted, const v1::Reference& stored);
 
 }  // namespace mapless

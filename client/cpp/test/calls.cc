@@ -4,6 +4,7 @@
 
 #include <cstdio>
 #include <cstdlib>
+#include <limits>
 #include <thread>
 
 using namespace mapless;
@@ -28,6 +29,13 @@ Expected Fails(Call call, const char* what) {
   }
   std::fprintf(stderr, "failed: %s: no error\n", what);
   std::exit(1);
+}
+
+// Two metres everywhere, and no value at the first pixel.
+v1::DepthImage Depth() {
+  std::vector<float> metres(96 * 64, 2.0F);
+  metres[0] = std::numeric_limits<float>::quiet_NaN();
+  return DepthMetres(metres, 96, 64, v1::DEPTH_SENSOR_STEREO);
 }
 
 v1::CreateReferenceRequest Reference(const std::string& id, const std::string& photo, double x_m) {
@@ -58,6 +66,12 @@ void Scenes(const Client& client, const std::string& photo) {
     return request;
   }()).reference().feature_count() == 1, "one more");
   client.DeleteReference("cpp", "one");
+  auto deep = Reference("deep", photo, 8);
+  deep.set_scene("scenes/cpp");
+  *deep.mutable_reference()->mutable_depth() = Depth();
+  Check(client.CreateReference(deep).reference().depth_sha256().size() == 64, "a reference with depth");
+  Check(client.GetReference("cpp", "deep", true).depth().float32() == Depth().float32(), "its depth comes back");
+  client.DeleteReference("cpp", "deep");
   const auto lost = Fails<NotFound>([&] { client.GetReference("cpp", "one"); }, "a deleted reference");
   Check(lost.resource == "scenes/cpp/references/one" && !lost.request_id.empty(), "the error names it, and the call");
 }
@@ -116,6 +130,7 @@ void Lost(const Client& client, const std::string& photo) {
   create.mutable_down_in_world()->set_x(1);
   Fails<AlreadyExists>([&] { client.CreateScene(create); }, "another of its name");
   auto one = Reference("one", photo, 7);
+  *one.mutable_reference()->mutable_depth() = Depth();
   one.set_scene("scenes/cpp");
   Check(client.CreateReference(one).reference().name() == "scenes/cpp/references/one", "a reference is stored once");
   Check(client.AddReferences("cpp", {Reference("a", photo, 1), Reference("b", photo, 2)}).size() == 2, "two, too");

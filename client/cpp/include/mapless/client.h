@@ -156,6 +156,12 @@ class Client {
 // A pinhole camera; (0, 0) is the centre of the top-left pixel.
 v1::CameraIntrinsics Pinhole(int width_px, int height_px, double focal_x_px, double focal_y_px, double principal_x_px,
                              double principal_y_px);
+// Depth that a sensor measured, for `depth` of a LocalizeRequest or Reference, of the photograph's camera, scaled; set `intrinsics`
+// and `camera_from_depth_camera` where it is of another one. A PNG with one channel of 16 bits; 1 is `unit_m`, 0 is no value.
+v1::DepthImage DepthPng(std::string png, double unit_m = 0.001, v1::DepthSensor sensor = v1::DEPTH_SENSOR_UNSPECIFIED);
+// Depth by metres, row by row; 0, NaN and infinity are no value. std::invalid_argument if there are not width times height.
+v1::DepthImage DepthMetres(const std::vector<float>& metres, int width_px, int height_px,
+                           v1::DepthSensor sensor = v1::DEPTH_SENSOR_UNSPECIFIED);
 // A pose by its quaternion and translation, world_from_camera.
 v1::RigidTransform Pose(double qx, double qy, double qz, double qw, double x_m, double y_m, double z_m);
 // The bytes of a file; std::runtime_error names one that cannot be read.
