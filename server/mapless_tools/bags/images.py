@@ -61,9 +61,9 @@ def open_images(recording: Recording, options: BagOptions, *, with_camera: bool 
     Without a camera, as where intrinsics are given, CameraInfo does not matter.
     """
     topic = _image_topic(recording, options.image_topic)
-    first = _first(recording, topic)
+    first = first_message(recording, topic)
     camera_topic = _camera_topic(recording, topic, options.camera_topic) if with_camera else ""
-    infos, line = _camera_infos(recording, camera_topic, topic, options.rectified) if camera_topic else (None, "")
+    infos, line = camera_infos(recording, camera_topic, topic, options.rectified) if camera_topic else (None, "")
     frame = first.header.frame_id.lstrip("/") or "(unnamed camera)"
     return Images(recording, topic, frame, infos, camera_topic, line, stamp_of(first))
 
@@ -80,7 +80,7 @@ def listed(topics: list[str]) -> str:
     return ", ".join(topics) or "none"
 
 
-def _first(recording: Recording, topic: str) -> Any:
+def first_message(recording: Recording, topic: str) -> Any:
     """The first image that has a time."""
     for it in recording.messages([topic]):
         if it.message is not None:
@@ -108,7 +108,7 @@ def _image_topic(recording: Recording, given: str) -> str:
 
 def _shows_photographs(recording: Recording, topic: str) -> bool:
     """Whether a topic shows photographs rather than depths, by its first message."""
-    message = _first(recording, topic)
+    message = first_message(recording, topic)
     return message.encoding in ENCODINGS if hasattr(message, "encoding") else "compressedDepth" not in message.format
 
 
@@ -124,7 +124,7 @@ def _camera_topic(recording: Recording, image_topic: str, given: str) -> str:
     raise ValueError(f"{recording.path} has {what}")
 
 
-def _camera_infos(recording: Recording, topic: str, image_topic: str, given: bool | None) -> tuple[CameraInfos, str]:
+def camera_infos(recording: Recording, topic: str, image_topic: str, given: bool | None) -> tuple[CameraInfos, str]:
     """All messages of a topic that have a camera, and which of their matrices is used; ValueError if none has one."""
     is_rectified = says_rectified(image_topic) if given is None else given
     infos = CameraInfos(is_rectified)

@@ -17,7 +17,7 @@ class DepthOptions:
     """What is used of the depths of a folder, and what its layout does not say of them; each field is a flag.
 
     `depth_sensor` and `depth_unit` replace the layout's own; the unit is the length of 1 in the values of a depth, in
-    the folder's unit of length.
+    the folder's unit of length. `depth_topic` is of a recording.
     """
 
     no_depth: Annotated[bool, typer.Option("--no-depth", help="Leave out the depths of photographs.")] = False
@@ -32,6 +32,11 @@ class DepthOptions:
         float | None,
         typer.Option(help="Length of 1 in depths, where it is not the layout's, in the folder's unit: 0.001."),
     ] = None
+
+    depth_topic: Annotated[
+        str,
+        typer.Option(help="Of a recording: topic of the depths, where there are several; default: the aligned ones."),
+    ] = ""
 
     def __post_init__(self) -> None:
         if self.no_depth and (self.depth_sensor or self.depth_unit is not None):

@@ -4,14 +4,19 @@ Keyframes are taken from the images of one camera: whenever it has moved or turn
 sharpest of the next few images. They are written to a folder of their own, which is removed when the process ends;
 JPEGs and PNGs as they are, others as PNGs. Poses are those of Odometry, PoseStamped or tf, interpolated, and moved to
 the camera by /tf_static. The recording is read twice, as a stream: what stays in memory is the poses and one message.
+
+A topic of depth images, if there is one, is read a third time: each keyframe has the nearest in time. Depths are of the
+images' own frame (aligned), or of a frame that /tf_static connects with it.
 """
 
+from __future__ import annotations
+
 import atexit
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -19,10 +24,15 @@ import numpy as np
 from mapless.geometry import RigidTransform, rotation_angle_deg
 from mapless.ros import RosCamera, pixels_from_image
 from mapless_tools.bags import is_recording
-from mapless_tools.dataset import Dataset
+from mapless_tools.bags.trajectory import FrameTree
+from mapless_tools.dataset import Dataset, DepthFile
 
 from .collecting import Collector, Intrinsics, KeyframeOptions, ReadOptions
+from .depths import FLOAT32
 from .writing import image_name
+
+if TYPE_CHECKING:
+    from mapless_tools.bags.images import Images
 
 CANDIDATES = 5
 """Images of which the sharpest becomes a keyframe; at 30 Hz, a sixth of a second."""
@@ -70,6 +80,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
             with collector.attempt(f"{images.topic} at {images.time_s(stamp_ns):.3f} s"):
                 raise ValueError(reason)
 
+        photos: dict[int, _Photo] = {}
         for stamp_ns, message, pose in keyframes(posed(), options.keyframes, refuse):
             with collector.attempt(f"{images.topic} at {images.time_s(stamp_ns):.3f} s"):
                 known = _given(options.intrinsics, message) if options.intrinsics else images.camera(stamp_ns)
@@ -77,8 +88,14 @@ def read(path: Path, options: ReadOptions) -> Dataset:
                 photo = known.photo(message, lossless=True)
                 name = image_name(str(stamp_ns), photo)
                 (collector.folder / name).write_bytes(photo)
-                collector.add(name, known.camera, pose, name=f"{prefix}/{stamp_ns}")
+                photos[stamp_ns] = _Photo(name, known, pose)
         unposed.end()
+        depths = {} if options.depths.no_depth else _depths(images, poses.tree, photos, collector, options)
+    for stamp_ns, it in photos.items():
+        with collector.attempt(f"{images.topic} at {images.time_s(stamp_ns):.3f} s"):
+            depth = depths.get(stamp_ns)
+            its = depth and collector.depth(depth, (it.camera.camera.width_px, it.camera.camera.height_px))
+            collector.add(it.name, it.camera.camera, it.world_from_camera, name=f"{prefix}/{stamp_ns}", depth=its)
     skipped = recording.skipped_lines()
     collector.notes.append(
         f"{len(collector.frames)} keyframes of {found} images on {images.topic} (frame {images.frame}, "
@@ -92,6 +109,47 @@ def read(path: Path, options: ReadOptions) -> Dataset:
         )
     name = path.resolve().name
     return collector.dataset(name, "rosbag", metric=True, source=f"recording {name}", ground_truth=poses.topic)
+
+
+@dataclass(frozen=True, eq=False)
+class _Photo:
+    """A keyframe: the name of its file, its camera and its pose."""
+
+    name: str
+    camera: RosCamera
+    world_from_camera: RigidTransform
+
+
+def _depths(
+    images: Images, tree: FrameTree, photos: Mapping[int, _Photo], collector: Collector, options: ReadOptions
+) -> dict[int, DepthFile]:
+    """Writes the depths of keyframes beside them; by stamp, with paths from the collector's folder."""
+    from mapless_tools.bags.depths import open_depths
+
+    found: dict[int, DepthFile] = {}
+    try:
+        depths = open_depths(images, options.depths.depth_topic)
+    except ValueError as error:
+        collector.notes.append(f"depths are left out: {error}")
+        return found
+    if depths is None:
+        return found
+    try:
+        is_same = depths.frame == images.frame
+        camera_from_depth = None if is_same else tree.lookup(images.frame, depths.frame, 0.0)
+    except (LookupError, ValueError) as error:
+        collector.notes.append(f"depths of {depths.topic} are left out: {error}")
+        return found
+    for stamp_ns, depth in depths.nearest(sorted(photos)):
+        with collector.attempt_depth(f"{depths.topic} at {images.time_s(stamp_ns):.3f} s"):
+            image = depth.image(photos[stamp_ns].camera, camera_from_depth)
+            path = Path(f"{stamp_ns}.depth{'.png' if image.size is None else FLOAT32}")
+            (collector.folder / path).write_bytes(image.data)
+            found[stamp_ns] = DepthFile(
+                path, image.unit_m, image.sensor, image.camera, image.camera_from_depth_camera, size=image.size
+            )
+    collector.notes.append(f"depths are those of {depths.topic} (frame {depths.frame}), nearest in time within 20 ms")
+    return found
 
 
 @dataclass
