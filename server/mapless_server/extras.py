@@ -10,6 +10,7 @@ _EXTRA_OF = {
     "jinja2": "tools",
     "kornia": "networks",
     "matplotlib": "tools",
+    "OpenEXR": "tools",
     "opentelemetry": "otel",
     "pillow_heif": "reconstruct",
     "pycolmap": "reconstruct",

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_tools.ingest.formats.icl_nuim import CAMERA as ICL_CAMERA
@@ -125,12 +126,39 @@ def kapture(folder: Path) -> Path:
     return folder
 
 
+def record3d(folder: Path) -> Path:
+    """Numbers 0 and 2 of three; the pixel without a value is NaN."""
+    poses = [TRUTH.poses[0], RigidTransform.identity(), TRUTH.poses[1]]
+    content: dict[str, object] = {"w": 96, "h": 64, "K": [99.0, 0, 0, 0, 99.0, 0, 9.0, 9.0, 1]}
+    content["perFrameIntrinsicCoeffs"] = [[80.0, 81.0, 47.75, 31.25]] * 3
+    rows = []
+    for pose in poses:
+        turned = RigidTransform.from_matrix(opengl(pose))
+        q = turned.quaternion()
+        rows.append([q.x, q.y, q.z, q.w, *turned.translation.tolist()])
+    for number in (0, 2):
+        write_image(folder / "rgb" / f"{number}.jpg", seed=number)
+    (folder / "metadata.json").write_text(json.dumps(content | {"poses": rows}))
+    depth = planted_depth_m(CAMERA.resized(48, 32))
+    depth[0, 0] = np.nan
+    write_exr(folder / "depth" / "0.exr", {"R": depth.astype(np.float32)})
+    return folder
+
+
+def write_exr(file: Path, channels: Mapping[str, np.ndarray]) -> None:
+    """An EXR of these channels, compressed as Record3D's."""
+    file.parent.mkdir(exist_ok=True)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, dict(channels)).write(str(file))
+
+
 LAYOUTS: Mapping[str, Callable[[Path], Path]] = {
     "7scenes": seven_scenes,
     "12scenes": twelve_scenes,
     "icl": icl_nuim,
     "arkit": polycam,
     "colmap": colmap_dense,
+    "record3d": record3d,
     "kapture": kapture,
 }
 

@@ -1,10 +1,11 @@
 """Depth in the layouts of others: the planted surface comes out in metres, and what is unusable is left out."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.depth_layouts import LAYOUTS, TRUTH, colmap_map
+from support.depth_layouts import LAYOUTS, TRUTH, colmap_map, write_exr
 from support.depths import assert_planted, planted_depth_m, png
 from support.layouts import CAMERA, assert_same_pose
 
@@ -189,3 +190,55 @@ def test_of_several_depths_of_kapture_the_nearest_is_taken(tmp_path: Path) -> No
     records.write_text("0, raw, 0.depth\n")
     assert depth_file(folder).name == "0.depth"
     assert_planted(read_dataset(folder).frames[0])
+
+
+def test_half_floats_of_record3d_are_metres(tmp_path: Path) -> None:
+    """1 mm at 1 to 2 m, 2 mm beyond."""
+    folder = LAYOUTS["record3d"](tmp_path)
+    depth = planted_depth_m(CAMERA.resized(48, 32))
+    depth[0, 0] = 0
+    write_exr(folder / "depth" / "0.exr", {"R": depth.astype(np.float16)})
+    assert_planted(read_dataset(folder).frames[0], 0.002)
+
+
+def test_an_exr_with_colours_is_no_depth(tmp_path: Path) -> None:
+    folder = LAYOUTS["record3d"](tmp_path)
+    depth = planted_depth_m(CAMERA.resized(48, 32)).astype(np.float32)
+    write_exr(folder / "depth" / "0.exr", {"R": depth, "A": depth})
+    dataset = read_dataset(folder)
+    assert dataset.frames[0].depth is None
+    assert any("channels A, R" in note for note in dataset.notes)
+
+
+def test_record3d_without_intrinsics_per_frame_has_k(tmp_path: Path) -> None:
+    folder = LAYOUTS["record3d"](tmp_path)
+    content = json.loads((folder / "metadata.json").read_text())
+    del content["perFrameIntrinsicCoeffs"]
+    content["K"] = [80.0, 0, 0, 0, 81.0, 0, 47.75, 31.25, 1]
+    (folder / "metadata.json").write_text(json.dumps(content))
+    assert_planted(read_dataset(folder).frames[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"poses": []}, "none of 0"),
+        ({"poses": [[0, 0, 0, 1, 0, 0]] * 3}, r"poses\[0\] must be 7 numbers"),
+        ({"w": 64, "h": 96}, "w and h are 64x96, the image is 96x64"),
+        ({"w": None}, "w and h"),
+        ({"perFrameIntrinsicCoeffs": None, "K": None}, "K must be"),
+        ({"poses": None}, "poses must be a list"),
+    ],
+)
+def test_wrong_metadata_of_record3d_is_named(tmp_path: Path, change: dict[str, object], said: str) -> None:
+    folder = LAYOUTS["record3d"](tmp_path)
+    content = json.loads((folder / "metadata.json").read_text())
+    (folder / "metadata.json").write_text(json.dumps(content | change))
+    with pytest.raises(ValueError, match=said):
+        read_dataset(folder)
+
+
+def test_files_of_record3d_name_the_export_that_is_read(tmp_path: Path) -> None:
+    (tmp_path / "scan.r3d").write_bytes(b"PK")
+    with pytest.raises(ValueError, match="EXR"):
+        read_dataset(tmp_path / "scan.r3d")

@@ -15,6 +15,7 @@ FORMATS = {
     "tum": "tum",
     "icl": "icl_nuim",
     "arkit": "arkit",
+    "record3d": "record3d",
     "kapture": "kapture",
     "rosbag": "rosbag",
 }

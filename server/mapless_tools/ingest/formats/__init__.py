@@ -67,6 +67,8 @@ def _with_masks(dataset: Dataset, path: Path, options: ReadOptions) -> Dataset:
 
 
 def _check_there(path: Path) -> None:
+    if path.suffix == ".r3d":
+        raise ValueError(f'{path}: files of Record3D are not read: export "EXR + RGB" from the app')
     if not (path.is_dir() or is_recording(path)):
         raise ValueError(f"{path} is not a folder, nor a recording ({', '.join(SUFFIXES)})")
 
