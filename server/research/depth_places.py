@@ -1,24 +1,54 @@
-"""Measures what the depth of references is worth, on folders with depth (`cameras.json`), through a server.
+"""Measures what the depth of references is worth, on folders with depth (`cameras.json`).
 
-    python -m research.depth_places ADDRESS FOLDER... [--pairs 40] [--queries 15]
+    python -m research.depth_places FOLDER... [--features auto] [--pairs 40] [--queries 16] [--json FILE]
 
-One reference with depth: photographs in which half of its depth is visible are localized by it alone. Several: 3, 5
-and 10 references, evenly spread, with their depth and without, and photographs between them. An answer is wrong if it
-is off by more than 5 % of the median depth. Scenes that it makes are deleted.
+One reference with depth: photographs in which half of its depth is visible are localized by it alone; a point is
+visible that is inside the photograph and not behind a depth that was measured with the photograph. Several: 3, 5
+and 10 references, evenly spread, with their depth and without, and photographs between them. Elsewhere: photographs of
+the other folders. An answer is wrong if it is off by more than 5 % of the median depth.
+
+The kind of a sensor is stated where the folder is known, as by people who know their camera. The poses of `lidar-desk`
+are ARKit's, whose scale is not the sensor's: there errors of one reference, but not their radii, are after the common
+scale that its README states. The engine works in this process. Features are kept in the folder of the cache, between
+runs.
 """
 
 import argparse
+import asyncio
+import hashlib
+import json
+import pickle
+import tempfile
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import betaincinv
 
-from mapless import Client, LocalizationResult, NewReference
-from mapless_server.images import ImageLimits, decode_depth
+from mapless.depth import DepthSensor
+from mapless.geometry import Camera
+from mapless_server.engine.options import EngineOptions
+from mapless_server.engine.query import Caller, Photo, Query, Tier
+from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.images import ImageLimits, decode_depth, decode_image
+from mapless_server.method.bundle.estimate import accuracy_from_covariance
+from mapless_server.method.features.extractors import FeatureExtractor, Mirrors
+from mapless_server.method.features.views import Ignored, PosedView, View
+from mapless_server.method.judge.answer import Localization
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.structure.measured_depth import MeasuredDepth
+from mapless_server.scenes import ANYWHERE
+from mapless_server.scheduling import Flow
+from mapless_server.security import SceneKey
+from mapless_server.serve.assembly import engine_over, make_tiers
+from mapless_server.settings import load_settings
+from mapless_server.store import NewReference, Store
 from mapless_tools.dataset import Frame
+from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.ingest.formats.cameras import read_folder
 
 WRONG_SHARE = 0.05
@@ -26,124 +56,330 @@ MIN_VISIBLE = 0.5
 COUNTS = (3, 5, 10)
 STEP = 37
 """Every so many pixels of a depth are projected."""
+HIDDEN_SHARE = 0.05
+"""A point is hidden if it is farther by a larger share than the depth that was measured there."""
+CACHE = Path(tempfile.gettempdir()) / "mapless-depth-places"
+SENSORS = {
+    "tum-teddy": DepthSensor.STRUCTURED_LIGHT,
+    "kinect-kitchen": DepthSensor.STRUCTURED_LIGHT,
+    "lidar-desk": DepthSensor.PHONE_LIDAR,
+    "realsense-robot": DepthSensor.STEREO,
+}
+SCALES = {"lidar-desk": 0.97}
+"""Scale of the poses by that of the depths."""
+LIMIT_S = 600.0
+WITH, WITHOUT = SceneKey("with"), SceneKey("without")
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """An answer: its error by the median depth, by both radii; None without a pose."""
+    """One answer.
 
-    share: float
-    of_68: float
-    of_95: float
-    error_m: float
+    Attributes:
+        place: the folder.
+        kind: "one", "several" or "elsewhere".
+        references: number of references.
+        has_depth: whether they have their depth.
+        query: name of the photograph.
+        median_m: median depth of the references.
+        error_m, error_deg: of an answer, after the common scale; None without one.
+        of_68, of_95: the position's error by both radii; None without an answer.
+        reason: of a rejection; empty for an answer.
+        rung: the attempt that gave it, or the last one.
+        processor_s: of all attempts.
+    """
+
+    place: str
+    kind: str
+    references: int
+    has_depth: bool
+    query: str
+    median_m: float
+    error_m: float | None
+    error_deg: float | None
+    of_68: float | None
+    of_95: float | None
+    reason: str
+    rung: str
+    processor_s: float
+
+    @property
+    def is_localized(self) -> bool:
+        """Whether there is an answer."""
+        return self.error_m is not None
+
+    @property
+    def share(self) -> float:
+        """The error by the median depth; infinite for a photograph of another place."""
+        return np.inf if self.kind == "elsewhere" else (self.error_m or 0.0) / self.median_m
 
 
 def main() -> None:
-    """Prints both tables as Markdown."""
+    """Prints the tables as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("address")
     parser.add_argument("folders", type=Path, nargs="+")
-    parser.add_argument("--pairs", type=int, default=40)
-    parser.add_argument("--queries", type=int, default=15)
+    parser.add_argument("--features", default="auto")
+    parser.add_argument("--pairs", type=int, default=40, help="of one reference and a photograph, a folder")
+    parser.add_argument("--queries", type=int, default=16, help="photographs for several references, a folder")
+    parser.add_argument("--counts", type=int, nargs="*", default=list(COUNTS))
+    parser.add_argument("--elsewhere", type=int, default=10, help="photographs of other folders, a folder")
+    parser.add_argument("--cache", type=Path, default=CACHE)
+    parser.add_argument("--json", type=Path, help="file to which each outcome is appended")
     arguments = parser.parse_args()
-    with Client(arguments.address) as client:
-        print(
-            "| place | one reference: localized | wrong | median error | in 68 % | in 95 % |\n|---|---|---|---|---|---|"
-        )
-        for folder in arguments.folders:
-            _print(folder.name, _alone(client, read_folder(folder).frames, arguments.pairs))
-        print("\n| place | references | depth | localized | wrong | median error |\n|---|---|---|---|---|---|")
-        for folder in arguments.folders:
-            _several(client, folder.name, read_folder(folder).frames, arguments.queries)
+    found = list[Outcome]()
+    for folder in arguments.folders:
+        others = [it for it in arguments.folders if it != folder]
+        with closing(_Place(folder, arguments.features, arguments.cache)) as place:
+            for outcome in place.outcomes(arguments.pairs, arguments.queries, arguments.counts):
+                found.append(_written(outcome, arguments.json))
+            for outcome in place.elsewhere(others, arguments.elsewhere):
+                found.append(_written(outcome, arguments.json))
+    print(*alone_rows(found), "", *several_rows(found), sep="\n")
 
 
-def _alone(client: Client, frames: Sequence[Frame], most: int) -> list[Outcome | None]:
-    """Outcomes of pairs, in an order that is random and always the same."""
-    pairs = [(i, j) for i in range(len(frames)) for j in range(len(frames)) if i != j and frames[i].depth]
-    np.random.default_rng(0).shuffle(pairs)
-    found: list[Outcome | None] = []
-    for i, j in pairs:
-        points, median_m = _points(frames[i])
-        if _visible_share(points, frames[j]) < MIN_VISIBLE:
-            continue
-        with _scene(client, [frames[i]], has_depth=True) as scene:
-            found.append(_localized(client, scene, frames[j], median_m))
-        if len(found) == most:
-            break
-    return found
+def _written(outcome: Outcome, file: Path | None) -> Outcome:
+    if file is not None:
+        with file.open("a") as opened:
+            opened.write(json.dumps(asdict(outcome)) + "\n")
+    return outcome
 
 
-def _several(client: Client, place: str, frames: Sequence[Frame], most: int) -> None:
-    for count in COUNTS:
-        chosen = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int)).tolist()
-        queries = [it for it in range(len(frames)) if it not in chosen]
-        queries = [queries[i] for i in np.unique(np.linspace(0, len(queries) - 1, most).astype(int))]
-        median_m = float(np.median([_points(frames[i])[1] for i in chosen]))
-        for has_depth in (False, True):
-            with _scene(client, [frames[i] for i in chosen], has_depth) as scene:
-                found = [_localized(client, scene, frames[i], median_m) for i in queries]
-            right = [it for it in found if it is not None]
-            wrong = sum(it.share > WRONG_SHARE for it in right)
-            error = f"{1000 * np.median([it.error_m for it in right]):.1f} mm" if right else ""
-            depth = "with" if has_depth else "without"
-            print(f"| {place} | {count} | {depth} | {len(right)} of {len(found)} | {wrong} | {error} |", flush=True)
+def alone_rows(found: Sequence[Outcome]) -> Iterator[str]:
+    """The table of one reference with depth, and of photographs of other places, with intervals of 95 %."""
+    yield "| place | localized | wrong | median error | in 68 % | in 95 % | elsewhere answered |"
+    yield "|---|---|---|---|---|---|---|"
+    one = [it for it in found if it.kind == "one"]
+    places = [*dict.fromkeys(it.place for it in one)]
+    for name, some in [*((p, [p]) for p in places), ("all", places)]:
+        its = [it for it in one if it.place in some]
+        right = [it for it in its if it.is_localized]
+        away = [it for it in found if it.kind == "elsewhere" and it.place in some]
+        cells = [
+            name,
+            _ratio(len(right), len(its)),
+            str(sum(it.share > WRONG_SHARE for it in right)),
+            f"{100 * np.median([it.share for it in right]):.2f} %",
+            _ratio(sum((it.of_68 or 0) <= 1 for it in right), len(right)),
+            _ratio(sum((it.of_95 or 0) <= 1 for it in right), len(right)),
+            f"{sum(it.is_localized for it in away)} of {len(away)}",
+        ]
+        yield f"| {' | '.join(cells)} |"
 
 
-def _print(place: str, found: Sequence[Outcome | None]) -> None:
-    right = [it for it in found if it is not None]
-    wrong = sum(it.share > WRONG_SHARE for it in right)
-    median = 100 * np.median([it.share for it in right])
-    in_68, in_95 = (100 * np.mean([getattr(it, name) <= 1 for it in right]) for name in ("of_68", "of_95"))
-    count = f"{len(right)} of {len(found)}"
-    print(f"| {place} | {count} | {wrong} | {median:.2f} % | {in_68:.0f} % | {in_95:.0f} % |", flush=True)
+def several_rows(found: Sequence[Outcome]) -> Iterator[str]:
+    """The table of several references, with their depth and without; the median is of photographs localized by both."""
+    yield "| place | references | localized without | with | wrong | median error without | with | with / without |"
+    yield "|---|---|---|---|---|---|---|---|"
+    several = [it for it in found if it.kind == "several"]
+    for place, count in dict.fromkeys((it.place, it.references) for it in several):
+        its = [it for it in several if (it.place, it.references) == (place, count)]
+        without, with_depth = ({it.query: it for it in its if it.has_depth is has} for has in (False, True))
+        both = [q for q in without if without[q].is_localized and with_depth[q].is_localized]
+        errors = [[1000 * (side[q].error_m or 0) for q in both] for side in (without, with_depth)]
+        wrong = [
+            sum(it.is_localized and it.share > WRONG_SHARE for it in side.values()) for side in (without, with_depth)
+        ]
+        counts = [f"{sum(it.is_localized for it in side.values())} of {len(side)}" for side in (without, with_depth)]
+        cells = [
+            place,
+            str(count),
+            *counts,
+            f"{wrong[0]}, {wrong[1]}",
+            *(f"{np.median(it):.1f} mm" if both else "" for it in errors),
+            _change(*errors) if both else "",
+        ]
+        yield f"| {' | '.join(cells)} |"
 
 
-@contextmanager
-def _scene(client: Client, frames: Sequence[Frame], has_depth: bool) -> Iterator[str]:
-    scene = "depth-places"
-    client.create_scene(scene)
-    try:
-        new = (
-            NewReference(
-                it.name, it.image_path, it.camera, it.world_from_camera, depth=it.read_depth() if has_depth else None
+def _change(before: Sequence[float], after: Sequence[float]) -> str:
+    """The geometric mean of the errors' ratios, with its interval of 95 %, by a bootstrap over photographs."""
+    ratios = np.log(np.maximum(after, 1e-3)) - np.log(np.maximum(before, 1e-3))
+    drawn = np.random.default_rng(0).choice(ratios, (2000, len(ratios))).mean(axis=1)
+    low, high = np.exp(np.quantile(drawn, [0.025, 0.975]))
+    return f"{np.exp(ratios.mean()):.2f} ({low:.2f} to {high:.2f})"
+
+
+def _ratio(count: int, total: int) -> str:
+    low, high = 100 * betaincinv(count + 0.5, total - count + 0.5, [0.025, 0.975])  # Jeffreys
+    return f"{count} of {total} ({low:.0f} to {high:.0f} %)"
+
+
+class _Place:
+    """A folder whose frames are all stored, with their depth in one scene and without in another."""
+
+    def __init__(self, folder: Path, features: str, cache: Path) -> None:
+        self._name, self._frames = folder.name, [known(it, folder.name) for it in read_folder(folder).frames]
+        self._data = tempfile.TemporaryDirectory()
+        self._loop = asyncio.new_event_loop()
+        self._store = Store.open(Path(self._data.name))
+        settings = load_settings({"data_dir": self._data.name, "features": features}).settings
+        tiers = [with_cache(it, cache) for it in make_tiers(settings)]
+        self._engine: QueueEngine = engine_over(self._store, tiers, EngineOptions(workers=1))
+        self._loop.run_until_complete(self._add())
+        self._depths = [_measured(it) if it.depth else None for it in self._frames]
+        self._points = [_points(it, depth) for it, depth in zip(self._frames, self._depths, strict=True)]
+
+    def close(self) -> None:
+        """Ends the engine and deletes the store."""
+        self._loop.run_until_complete(self._engine.close())
+        self._store.close()
+        self._loop.close()
+        self._data.cleanup()
+
+    def outcomes(self, pairs: int, queries: int, counts: Sequence[int]) -> Iterator[Outcome]:
+        """Those of one reference, and of several."""
+        chosen = [(i, j) for i in range(len(self._frames)) for j in range(len(self._frames)) if i != j]
+        np.random.default_rng(0).shuffle(chosen)
+        seen = ((i, j) for i, j in chosen if self._frames[i].depth and self._visible_share(i, j) >= MIN_VISIBLE)
+        for (i, j), _ in zip(seen, range(pairs), strict=False):
+            yield self._outcome("one", [i], self._frames[j], has_depth=True)
+        for count in counts:
+            few = np.unique(np.linspace(0, len(self._frames) - 1, count).round().astype(int)).tolist()
+            others = [it for it in range(len(self._frames)) if it not in few]
+            for j in np.unique(np.linspace(0, len(others) - 1, queries).astype(int)):
+                for has_depth in (False, True):
+                    yield self._outcome("several", few, self._frames[others[j]], has_depth)
+
+    def elsewhere(self, others: Sequence[Path], count: int) -> Iterator[Outcome]:
+        """Photographs of other folders, each by one reference."""
+        for number in range(count if others else 0):
+            frames = read_folder(others[number % len(others)]).frames
+            i, j = (7 * number) % len(self._frames), (5 * number) % len(frames)
+            if self._frames[i].depth:
+                yield self._outcome("elsewhere", [i], frames[j], has_depth=True)
+
+    async def _add(self) -> None:
+        photos = [Photo(it.image_path.read_bytes(), it.camera, "image") for it in self._frames]
+        described = await self._engine.describe(photos, _caller())
+        for scene in (WITH, WITHOUT):
+            self._store.create_scene(scene)
+            self._store.add_references(
+                scene,
+                [
+                    NewReference(
+                        f"r{i}",
+                        photo.image,
+                        photo.camera,
+                        frame.world_from_camera,
+                        it.views,
+                        it.descriptors,
+                        depth=frame.read_depth() if scene is WITH else None,
+                    )
+                    for i, (frame, photo, it) in enumerate(zip(self._frames, photos, described, strict=True))
+                ],
             )
-            for it in frames
-        )
-        client.add_references(scene, new)
-        yield scene
-    finally:
-        client.delete_scene(scene)
+
+    def _outcome(self, kind: str, references: Sequence[int], frame: Frame, has_depth: bool) -> Outcome:
+        photo = Photo(frame.image_path.read_bytes(), frame.camera, "image")
+        ids = tuple(f"r{i}" for i in references)
+        query = Query(WITH if has_depth else WITHOUT, ids, photo, ANYWHERE, 10, LocalizeOptions(), is_generic=True)
+        result = self._loop.run_until_complete(self._engine.run(self._engine.query_job(query, _caller())))
+        outcome, median_m = result.answer.outcome, float(np.median([self._points[i][1] for i in references]))
+        rung = next((it.rung for it in result.attempts if it.is_chosen), "")
+        spent_s = sum(it.processor_s for it in result.attempts)
+        about = self._name, kind, len(references), has_depth, frame.name, median_m
+        if not isinstance(outcome, Localization):
+            return Outcome(*about, None, None, None, None, f"{outcome.reason.value}: {outcome.message}", rung, spent_s)
+        error_m, error_deg = pose_error(frame.world_from_camera, outcome.world_from_camera)
+        assert outcome.covariance is not None
+        radii = accuracy_from_covariance(outcome.covariance)
+        ratios = error_m / radii.position_68_m, error_m / radii.position_95_m
+        if kind == "one":
+            centre = self._frames[references[0]].world_from_camera.translation
+            scaled = SCALES.get(self._name, 1.0) * (outcome.world_from_camera.translation - centre)
+            error_m = float(np.linalg.norm(centre + scaled - frame.world_from_camera.translation))
+        return Outcome(*about, error_m, error_deg, *ratios, "", rung, spent_s)
+
+    def _visible_share(self, i: int, j: int) -> float:
+        """Share of a frame's points that another one's photograph shows."""
+        camera, x = self._frames[j].camera, self._frames[j].world_from_camera.inverse().apply(self._points[i][0])
+        in_front = x[:, 2] > 0
+        pixels = camera.project(np.where(in_front[:, None], x, [0.0, 0.0, 1.0]))
+        inside = in_front & ((pixels >= 0) & (pixels < (camera.width_px, camera.height_px))).all(axis=1)
+        measured = self._depths[j]
+        if measured is None:
+            return float(inside.mean())
+        height, width = measured.depth.shape
+        column, row = np.rint(measured.camera.project(x[inside])).astype(int).T
+        there = measured.depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        return float((~(x[inside, 2] > (1 + HIDDEN_SHARE) * there)).sum() / len(x))
 
 
-def _localized(client: Client, scene: str, frame: Frame, median_m: float) -> Outcome | None:
-    answer = client.localize(frame.image_path, frame.camera, scene, ignore_calibration=True)
-    if not isinstance(answer, LocalizationResult) or answer.accuracy is None:
-        return None
-    error_m = float(np.linalg.norm(answer.world_from_camera.translation - frame.world_from_camera.translation))
-    return Outcome(
-        error_m / median_m, error_m / answer.accuracy.position_68_m, error_m / answer.accuracy.position_95_m, error_m
-    )
+@dataclass(frozen=True)
+class _Kept:
+    """An extractor whose views are kept in a folder."""
+
+    made: FeatureExtractor
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        return self.made.name
+
+    def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
+        if ignored is not None:
+            return self.made.extract(image, camera, ignored)
+        key = hashlib.sha256(image.tobytes() + repr((image.shape, camera, self.name)).encode()).hexdigest()
+        file = self.folder / f"{key}.pickle"
+        if not file.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(pickle.dumps(self.made.extract(image, camera)))
+        view: View = pickle.loads(file.read_bytes())
+        return view
 
 
-def _points(frame: Frame) -> tuple[np.ndarray, float]:
-    """Points (P, 3) of a frame's depth in the world, and its median."""
+class _KeptMirrors(_Kept):
+    """The same for features that are known of a mirror image, too."""
+
+    def mirrored(self, view: View) -> View:
+        assert isinstance(self.made, Mirrors)
+        return self.made.mirrored(view)
+
+
+def with_cache(tier: Tier, folder: Path) -> Tier:
+    """The tier with features that are kept in a folder."""
+    is_mirroring = isinstance(tier.extractor, Mirrors)
+    return replace(tier, extractor=(_KeptMirrors if is_mirroring else _Kept)(tier.extractor, folder))
+
+
+def posed(place: str, frames: Sequence[Frame], tier: Tier) -> list[PosedView]:
+    """Frames as references with their depth."""
+    views = list[PosedView]()
+    for frame in frames:
+        view = tier.extractor.extract(decode_image(frame.image_path.read_bytes(), ImageLimits()), frame.camera)
+        depths = None if frame.depth is None else _measured(frame, as_seen=False).at_keypoints(view)
+        views.append(PosedView(f"{place}-{frame.name}", frame.name, view, frame.world_from_camera, depths))
+    return views
+
+
+def _caller() -> Caller:
+    return Caller(Flow("", "research"), time.monotonic() + LIMIT_S)
+
+
+def known(frame: Frame, place: str) -> Frame:
+    """The frame with its sensor."""
+    if frame.depth is None or place not in SENSORS:
+        return frame
+    return replace(frame, depth=replace(frame.depth, sensor=SENSORS[place]))
+
+
+def _measured(frame: Frame, as_seen: bool = True) -> MeasuredDepth:
+    """A frame's depth, by default as its photograph's camera sees it."""
     assert frame.depth is not None
     image, photo = frame.depth.read(), frame.camera
     depth = decode_depth(image, (photo.width_px, photo.height_px), ImageLimits())
     camera = image.camera or photo.resized(*depth.shape[::-1])
-    points = MeasuredDepth(camera, depth, image.known_noise).points()[::STEP]
-    if image.camera_from_depth_camera is not None:
-        points = image.camera_from_depth_camera.apply(points)
+    measured = MeasuredDepth(camera, depth, image.known_noise, image.camera_from_depth_camera)
+    is_aligned = image.camera_from_depth_camera is None
+    return measured if is_aligned or not as_seen else measured.seen_by(photo.pinhole())
+
+
+def _points(frame: Frame, measured: MeasuredDepth | None) -> tuple[np.ndarray, float]:
+    """Points (P, 3) of a frame's depth in the world, and its median; none without depth."""
+    if measured is None:
+        return np.empty((0, 3)), 0.0
+    points = measured.points()[::STEP]
     return frame.world_from_camera.apply(points), float(np.median(points[:, 2]))
-
-
-def _visible_share(points: np.ndarray, frame: Frame) -> float:
-    """Share of points (P, 3) that a frame's photograph would show if nothing hid them."""
-    x = frame.world_from_camera.inverse().apply(points)
-    in_front = x[:, 2] > 0
-    pixels = frame.camera.project(np.where(in_front[:, None], x, [0.0, 0.0, 1.0]))
-    inside = ((pixels >= 0) & (pixels < (frame.camera.width_px, frame.camera.height_px))).all(axis=1)
-    return float((in_front & inside).mean())
 
 
 if __name__ == "__main__":

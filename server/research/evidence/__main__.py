@@ -31,6 +31,7 @@ MODULES = {
     "scene_agreement": ("scene-agreement",),
     "rungs": ("rungs",),
     "readings": ("readings", "suspects"),
+    "depth_errors": ("depth-errors",),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }
 """The keys of each module, by its MEASUREMENTS; a module is imported when one of them is measured."""

@@ -216,16 +216,13 @@ def scale_covariance(world_from_camera: RigidTransform, centroid: Array, relativ
 
 
 def _by_depths(seen: ViewColumns, to_pose: Array, points: EliminatedPoints) -> Array:
-    """Motions (K, 6) of the pose by the factors of the references' depths, one standard deviation of each; or none."""
+    """Motions (2 K, 6) of the pose by each standard deviation of errors that a reference's depths share; or none."""
     planes = seen.planes
     if planes is None:
         return np.zeros((0, 6))
-    change = planes.normal.T * (planes.information * planes.common)  # of -h
-    eliminated, motions = np.stack(forward(points.factor, change)), []
-    for view in range(len(seen.parts) - 1):
-        of_view = np.where(planes.view == view, eliminated, 0.0).ravel()
-        motions.append(-to_pose @ (points.cross[: to_pose.shape[1]] @ of_view))
-    return np.array(motions)
+    changes = [planes.normal.T * (planes.information * common) for common in planes.common.T]  # of -h
+    eliminated = [np.stack(forward(points.factor, it)).ravel() for it in changes]
+    return np.array([-to_pose @ (points.cross[: to_pose.shape[1]] @ it) for it in eliminated])
 
 
 def _without_each(

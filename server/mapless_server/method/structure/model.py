@@ -83,15 +83,15 @@ class MetricScale:
 
 @dataclass(frozen=True, eq=False)
 class DepthPlanes:
-    """Planes from depths: each of P points is near a plane, normal . x = offset.
+    """Planes from depths: each of P points is near a plane, normal . x = offset, or near none.
 
     Attributes:
         normal: (P, 3) unit vectors, world.
         offset: (P,) metres.
         information: (P,) inverse variance of the distance from the plane; 0 if unknown.
         view: (P,) the reference whose depth it is.
-        common: (P,) change of the offset by one standard deviation of the factor that all depths of the reference
-            share, metres.
+        common: (P, 2) change of the offset by one standard deviation of each of the independent errors that all depths
+            of the reference share, metres.
     """
 
     normal: Array
@@ -100,7 +100,7 @@ class DepthPlanes:
     view: NDArray[np.intp]
     common: Array
 
-    def __getitem__(self, points: NDArray[np.bool_] | NDArray[np.intp]) -> DepthPlanes:
+    def __getitem__(self, points: Rows) -> DepthPlanes:
         columns = self.offset[points], self.information[points], self.view[points], self.common[points]
         return DepthPlanes(self.normal[points], *columns)
 
@@ -108,7 +108,7 @@ class DepthPlanes:
     def unknown(count: int) -> DepthPlanes:
         """Planes of points that are near none."""
         nothing = np.zeros(count)
-        return DepthPlanes(np.zeros((count, 3)), nothing, nothing, np.zeros(count, np.intp), nothing)
+        return DepthPlanes(np.zeros((count, 3)), nothing, nothing, np.zeros(count, np.intp), np.zeros((count, 2)))
 
     def and_last(self, others: DepthPlanes) -> DepthPlanes:
         """Appends the planes of further points."""
