@@ -27,6 +27,7 @@ class Agreement:
         explanation: the likely mistake, as `pairs.readings` names it; empty if there is none, or it is not known yet.
         median_depth: median depth of what pairs that agree show, in the scene's unit; None if it is not known.
         same_pose: one sentence each about references with exactly one pose that show different things.
+        depths: one sentence each about measured depths that do not fit what other references see.
     """
 
     pair_count: int = 0
@@ -37,6 +38,7 @@ class Agreement:
     explanation: str = ""
     median_depth: float | None = None
     same_pose: tuple[str, ...] = ()
+    depths: tuple[str, ...] = ()
 
     @property
     def contradicts_itself(self) -> bool:
@@ -62,10 +64,11 @@ class Agreement:
     def warnings(self, arbitrary_unit: bool) -> list[str]:
         """Sentences about the scene: its contradiction or, without one and unless its unit is arbitrary, its unit.
 
-        Also references with exactly one pose that show different things.
+        Also references with exactly one pose that show different things, and wrong depths where poses are right.
         """
         unit = "" if arbitrary_unit else implausible_depth(self.median_depth)
-        return [it for it in (self.contradiction or unit, *self.same_pose) if it]
+        depths = () if arbitrary_unit or self.contradicts_itself else self.depths
+        return [it for it in (self.contradiction or unit, *self.same_pose, *depths) if it]
 
 
 def agreement_of(errors_px: Mapping[Pair, float]) -> Agreement:

@@ -29,20 +29,21 @@ class MeasuredDepths:
             return reference
         found = self._cache.get((record.key, extractor))
         if found is None:
-            found = self._read(record).at_keypoints(reference.view)
+            found = read_measured(self._store, record).at_keypoints(reference.view)
             self._cache.put((record.key, extractor), found, found.depth.nbytes + found.relative_sigma.nbytes)
         return replace(reference, depths=found)
 
-    def _read(self, record: ReferenceRecord) -> MeasuredDepth:
-        image, photo = self._store.read_depth_of(record.key), record.camera
-        try:
-            depth = decode_depth(image, (photo.width_px, photo.height_px), ANY_SIZE)
-        except InvalidArgument as error:
-            raise DataLoss(f"the depth of reference {record.reference_id!r} cannot be read: {error}") from error
-        height, width = depth.shape
-        return MeasuredDepth(
-            image.camera or photo.resized(width, height),
-            depth,
-            image.known_noise,
-            image.camera_from_depth_camera,
-        )
+
+def read_measured(store: Store, record: ReferenceRecord) -> MeasuredDepth:
+    """The depth that was measured with a reference that has one.
+
+    NotFound if the reference was deleted, DataLoss if its depth is damaged.
+    """
+    image, photo = store.read_depth_of(record.key), record.camera
+    try:
+        depth = decode_depth(image, (photo.width_px, photo.height_px), ANY_SIZE)
+    except InvalidArgument as error:
+        raise DataLoss(f"the depth of reference {record.reference_id!r} cannot be read: {error}") from error
+    height, width = depth.shape
+    camera = image.camera or photo.resized(width, height)
+    return MeasuredDepth(camera, depth, image.known_noise, image.camera_from_depth_camera)

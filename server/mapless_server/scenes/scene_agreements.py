@@ -29,6 +29,7 @@ from mapless_server.store import Store
 from mapless_server.store.pairs import Pair, PairStore
 
 from .agreement import Agreement, agreement_of
+from .depth_checks import DepthCheck, DepthChecks, depth_warnings
 from .explaining import NAMED, SceneExplainer, spread
 from .indexes import SceneIndexes
 from .library import Closed, ReferenceLibrary
@@ -55,6 +56,8 @@ STALE_S, REST_FACTOR = 2.0, 50.0
 take a tenth of a second, which queries would have to share."""
 FAILED_S = 60.0
 """Where that failed, it is tried again after so long."""
+DEPTHS_S, DEPTHS_REST_FACTOR = 2.0, 4.0
+"""Depths of references are compared so long at once, 0.1 s each, and then not for so many times as long."""
 LONGEST_WAIT_S = 3.0
 """For what must be computed, by who asks for the agreement as it is now."""
 _KNOWN_SCENES = 10_000
@@ -85,7 +88,7 @@ class _Known:
 
     `sampled_size` is the number of its references when they were sampled, `explained` has the pairs by which it was
     explained, `measured` those by which its depth was measured; before `rests_until_s`, by `time.monotonic`, nothing is
-    derived again.
+    derived again. `depths` are the results for depths by the ids of references, complete as of `depths_generation`.
     """
 
     errors_px: dict[Pair, float] = field(default_factory=dict)
@@ -95,6 +98,8 @@ class _Known:
     explained: _Basis = _Basis()
     measured: _Basis = _Basis()
     rests_until_s: float = -math.inf
+    depths: dict[str, DepthCheck] = field(default_factory=dict)
+    depths_generation: int = -1
     update: "Future[None] | None" = None
 
 
@@ -109,8 +114,10 @@ class SceneAgreements:
         extractor: FeatureExtractor,
         matcher: Matcher,
         observer: BackgroundObserver,
+        depths: DepthChecks | None = None,
     ) -> None:
-        """The extractor and the matcher compare references: those of one of the tiers."""
+        """The extractor and the matcher compare references: those of one of the tiers; None compares no depths."""
+        self._store, self._depths = store, depths
         self._pairs = PairStore(store.database)
         self._indexes, self._matcher = indexes, matcher
         self._explainer = SceneExplainer(indexes, library, extractor, matcher, self._check)
@@ -245,6 +252,27 @@ class SceneAgreements:
                 self._explain(scene_key, known, found, list(others))
         else:
             self._measure(scene_key, known, found, errors_px)
+            self._check_depths(scene_key, known)
+
+    def _check_depths(self, scene_key: SceneKey, known: _Known) -> None:
+        """Compares depths that were measured with references with their neighbours, the new ones first."""
+        if self._depths is None or (generation := self._store.get_generation(scene_key)) == known.depths_generation:
+            return
+        begin_s, wanted = time.monotonic(), self._depths.with_depth(scene_key)
+        known.depths = {it: known.depths[it] for it in wanted if it in known.depths}
+        for reference_id in sorted(wanted, key=lambda it: it in known.depths):
+            if time.monotonic() > begin_s + DEPTHS_S:
+                break
+            found = self._depths.check(scene_key, reference_id, self._check)
+            if found is not None:
+                known.depths[reference_id] = found
+        else:
+            known.depths_generation = generation
+        with self._guard:
+            if known.rests_until_s > begin_s:  # nothing has changed meanwhile
+                spent_s = time.monotonic() - begin_s
+                known.rests_until_s = max(known.rests_until_s, begin_s + DEPTHS_REST_FACTOR * spent_s)
+        self._settle(scene_key, known, self._agreement(scene_key))
 
     def _explain(self, scene_key: SceneKey, known: _Known, found: Agreement, pairs: Sequence[Pair]) -> None:
         """Finds the likely mistake, if the pairs are others than when that was tried."""
@@ -280,6 +308,8 @@ class SceneAgreements:
             found = replace(found, explanation=before.explanation)
         if found.agreeing_count and found.median_depth is None:
             found = replace(found, median_depth=before.median_depth)
+        found = replace(found, depths=tuple(depth_warnings(known.depths)))
+        new = [it for it in found.depths if it not in before.depths]
         with self._guard:
             known.agreement = found
             if self._scenes.get(scene_key) is not known:  # deleted meanwhile
@@ -293,6 +323,8 @@ class SceneAgreements:
                 log.info("scene %s does not contradict itself any more", scene_key)
         elif found.explanation and not before.explanation:
             log.warning("scene %s: likely: %s", scene_key, found.explanation)
+        for text in new:
+            log.warning("scene %s: %s", scene_key, text)
 
     def _count(self) -> None:
         self._observer.waiting("contradicting_scenes", len(self._contradicting))

@@ -31,6 +31,7 @@ from mapless_server.scenes.audit.scene_auditor import SceneTools
 from mapless_server.scenes.background import BackgroundMatching, SceneWork
 from mapless_server.scenes.calibration.calibrator import Calibrator, SceneCalibrations
 from mapless_server.scenes.depth.scene_depths import DepthMaker, SceneDepths
+from mapless_server.scenes.depth_checks import DepthChecks
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
@@ -179,8 +180,10 @@ def engine_over(store: Store, tiers: Sequence[Tier], options: EngineOptions, par
     pairs = PairMatches(matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
     # References that are rolled against one another agree only by what matches at any roll.
     comparing = any_roll[0] if any_roll else tiers[0]
-    agreements = SceneAgreements(store, indexes, library, comparing.extractor, comparing.pipeline.matcher, observed)
-    tools = SceneTools(library, indexes, descriptor, first, pairs)
+    compared = comparing.extractor, comparing.pipeline.matcher
+    checks = DepthChecks(store, indexes, library, *compared)
+    agreements = SceneAgreements(store, indexes, library, *compared, observed, checks)
+    tools = SceneTools(library, indexes, descriptor, first, pairs, checks)
     references = References(tools, retrievals, extractors, options.image_limits, agreements)
     engine = QueueEngine(tiers, references, options, parts.observer, parts.quota, parts.method)
     maker = None

@@ -253,6 +253,13 @@ class StoreReader:
         found = self._read_page(select(tables.reference.c.reference_id), scene_key, limit, after)
         return [row.reference_id for row in found]
 
+    def list_with_depth(self, scene_key: SceneKey) -> list[str]:
+        """Ids of the references with a measured depth, in the order of ids; empty if there is no such scene."""
+        column = tables.reference.c
+        statement = select(column.reference_id).where(column.scene_id == scene_key, column.depth_sha256.is_not(None))
+        with self.database.read() as connection:
+            return list(connection.execute(statement.order_by(column.reference_id)).scalars())
+
     def _read_page(self, statement: Select[Any], scene_key: SceneKey, limit: int, after: str) -> Sequence[Row[Any]]:
         column = tables.reference.c
         page = statement.where(column.scene_id == scene_key, column.reference_id > after)

@@ -25,7 +25,14 @@ if TYPE_CHECKING:
     from mapless import Client, ReferenceAudit, RigidTransform
     from mapless import Scene as KnownScene
 
-ALARMS = ("SWAPPED_IMAGE", "WRONG_POSE_AND_INTRINSICS", "WRONG_POSE", "WRONG_INTRINSICS", "SCENE_CHANGED")
+ALARMS = (
+    "SWAPPED_IMAGE",
+    "WRONG_POSE_AND_INTRINSICS",
+    "WRONG_POSE",
+    "WRONG_INTRINSICS",
+    "SCENE_CHANGED",
+    "WRONG_DEPTH",
+)
 """Findings that cause wrong poses, the worst first."""
 MAX_PAGE = 100
 COMPARED = 1000

@@ -13,6 +13,7 @@ the common factor does not remove. So this error counts in each depth, too; else
 ones, more than triangulated points.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -44,13 +45,33 @@ class MeasuredDepth:
 
     def at_keypoints(self, view: View) -> KeypointDepths:
         """The depths at the keypoints of the photograph, with their standard deviations."""
-        seen = self if self.camera_from_depth_camera is None else self.seen_by(view.camera)
-        pixels = seen.camera.project(view.camera.rays(view.features.pixels()))
-        depth = _depth_at(seen.depth, pixels, self.noise)
+        depth = self.at_pixels(view.camera, view.features.pixels())
         sigma = np.hypot(self.noise.sigma_m(depth) / depth, self.noise.common)
         return KeypointDepths(
             depth.astype(np.float32), sigma.astype(np.float32), self.noise.common, DepthSource.MEASURED
         )
+
+    def on_grid(self, camera: Camera, count: int) -> tuple[Array, Array]:
+        """Pixels (N, 2) of the photograph's camera (a pinhole), on a grid of about so many, and their depths (N,)."""
+        step = math.sqrt(camera.width_px * camera.height_px / count)
+        across, down = (np.arange(step / 2, side - 1, step) for side in (camera.width_px, camera.height_px))
+        pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        depth = self.at_pixels(camera, pixels)
+        known = np.isfinite(depth)
+        return pixels[known], depth[known]
+
+    def inverse_in(self, camera: Camera) -> tuple[Camera, NDArray[np.float32]]:
+        """Inverse depths (H, W) as the photograph's camera sees them, without edges, NaN where there is none.
+
+        Their camera comes first. `at_keypoints` interpolates between the same values.
+        """
+        seen = self if self.camera_from_depth_camera is None else self.seen_by(camera)
+        return seen.camera, _inverse_without_edges(seen.depth, self.noise)
+
+    def at_pixels(self, camera: Camera, pixels: Array) -> Array:
+        """Depths (N,) at pixels (N, 2) of the photograph's camera, a pinhole; NaN where there is none."""
+        seen = self if self.camera_from_depth_camera is None else self.seen_by(camera)
+        return _depth_at(seen.depth, seen.camera.project(camera.rays(pixels)), self.noise)
 
     def seen_by(self, camera: Camera) -> "MeasuredDepth":
         """The depths as a camera (a pinhole) sees them that is at the photograph's place."""
@@ -130,6 +151,18 @@ def _without_edges(patches: Array, noise: DepthNoise) -> Array:
     bends = [np.abs(sums / inverse[:, 1:-1, 1:-1] - 2) > limit for sums in (across, down)]
     near_edge = sliding_window_view(bends[0] | bends[1], (3, 3), axis=(1, 2)).any(axis=(-2, -1))
     return np.where(near_edge, np.nan, inverse[:, 2:-2, 2:-2])
+
+
+def _inverse_without_edges(depth: NDArray[np.float32], noise: DepthNoise) -> NDArray[np.float32]:
+    """Inverse depths (H, W) of a whole image; NaN where `_without_edges` has none."""
+    with np.errstate(invalid="ignore"):
+        inverse = 1 / depth
+        limit = 3 * np.sqrt(6) * (noise.constant_m * inverse + (noise.linear + noise.quadratic_per_m * depth))
+        is_edge = np.zeros(depth.shape, np.uint8)
+        inner = inverse[1:-1, 1:-1]
+        for sums in (inverse[1:-1, 2:] + inverse[1:-1, :-2], inverse[2:, 1:-1] + inverse[:-2, 1:-1]):
+            is_edge[1:-1, 1:-1] |= np.abs(sums / inner - 2) > limit[1:-1, 1:-1]
+    return np.where(cv2.dilate(is_edge, np.ones((3, 3), np.uint8)) > 0, np.float32(np.nan), inverse)
 
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:

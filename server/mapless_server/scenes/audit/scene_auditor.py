@@ -14,6 +14,7 @@ from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey, scene_id_of
 
+from ..depth_checks import DepthChecks
 from ..indexes import SceneIndexes
 from ..library import ReferenceLibrary
 from ..retrieval.index import Entries, GlobalDescriptor, Rows
@@ -49,7 +50,7 @@ class SceneTools:
     """The tools that choose, load and compare the references of all scenes.
 
     The extractor is the first tier's, whose features every reference has; `pairs` caches matches, for all calls
-    together.
+    together. `depths` checks measured depths; None checks none.
     """
 
     library: ReferenceLibrary
@@ -57,6 +58,7 @@ class SceneTools:
     descriptor: GlobalDescriptor
     extractor: FeatureExtractor
     pairs: PairMatches
+    depths: DepthChecks | None = None
 
 
 class SceneAuditor:
@@ -108,7 +110,7 @@ class SceneAuditor:
         name = self._name(reference_id)
         try:
             tools, context = self._tools, StageContext(self._check)
-            _, (view,) = tools.library.load(self._scene_key, [reference_id], tools.extractor, context)
+            scene, (view,) = tools.library.load(self._scene_key, [reference_id], tools.extractor, context)
         except DataLoss:
             return ReferenceAudit(name, AuditVerdict.UNVERIFIABLE, DAMAGED)
         except NotFound as error:
@@ -125,7 +127,23 @@ class SceneAuditor:
         if self._auditor is None:
             finder = self._finder(entries.rows())
             self._auditor = Auditor(finder, self._tools.pairs, lambda: self._check())
-        return replace(self._auditor.audit(name), provenance=view.provenance)
+        found = replace(self._auditor.audit(name), provenance=view.provenance)
+        try:
+            is_arbitrary = scene.attributes.arbitrary_unit
+        except DataLoss:  # its unit may be arbitrary
+            is_arbitrary = True
+        return found if is_arbitrary else self._with_depth(found, reference_id)
+
+    def _with_depth(self, found: ReferenceAudit, reference_id: str) -> ReferenceAudit:
+        """The audit of a reference with what is wrong with its measured depth, unless a worse fault explains it."""
+        if found.verdict.is_alarm or self._tools.depths is None:
+            return found
+        checked = self._tools.depths.check(self._scene_key, reference_id, self._check)
+        if checked is not None and checked.verdict.mistake:
+            return replace(found, verdict=AuditVerdict.WRONG_DEPTH, message=f"its depth: {checked.verdict.mistake}")
+        if checked is not None and checked.doubt:
+            return replace(found, message="; ".join(it for it in (found.message, checked.doubt) if it))
+        return found
 
     def _check_coverage(self, view: Viewpoint) -> Coverage:
         entries = self._read()

@@ -17,6 +17,8 @@ class AuditVerdict(str, Enum):
     WRONG_POSE_AND_INTRINSICS = "wrong_pose_and_intrinsics"
     SCENE_CHANGED = "scene_changed"
     """Pose and intrinsics fit, or cannot be judged, but it does not show what its neighbours show there."""
+    WRONG_DEPTH = "wrong_depth"
+    """Pose and intrinsics fit, or cannot be judged, but the depth that was measured with it does not."""
     DUPLICATE = "duplicate"
     """Nothing is wrong, but another reference is the same photograph, or the same view from the same place."""
     UNVERIFIABLE = "unverifiable"
@@ -36,6 +38,7 @@ _ALARMS = frozenset(
         AuditVerdict.WRONG_INTRINSICS,
         AuditVerdict.WRONG_POSE_AND_INTRINSICS,
         AuditVerdict.SCENE_CHANGED,
+        AuditVerdict.WRONG_DEPTH,
     }
 )
 

@@ -1,0 +1,52 @@
+"""A wrong depth through a server: warned of when the scene is asked for, and found by the audit in the same place."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.depths import png
+from support.servers import serving_really
+
+from mapless import Client, DepthImage, DepthSensor, NewReference
+from mapless_tools.demo import depth_map_m, room
+
+pytestmark = pytest.mark.nightly
+"""A real server; the parts are tested in `method` and `scenes`."""
+
+MISTAKE = "it is mirrored, left for right"
+
+
+def depth_of(name: str) -> DepthImage:
+    return DepthImage(png(np.rint(1000 * depth_map_m(name)).astype(np.uint16)), 0.001, sensor=DepthSensor.RENDERED)
+
+
+def mirrored(depth: DepthImage) -> DepthImage:
+    values = cv2.imdecode(np.frombuffer(depth.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert values is not None
+    return replace(depth, data=png(np.asarray(values[:, ::-1], np.uint16)))
+
+
+def test_a_wrong_depth_is_warned_of_and_found_by_the_audit(tmp_path: Path) -> None:
+    chosen = room().references[:4]
+    depths = {it.name: depth_of(it.name) for it in chosen}
+    depths[chosen[2].name] = mirrored(depths[chosen[2].name])
+    with (
+        serving_really(tmp_path, features="sift", background_matching=False) as server,
+        Client(server.address) as client,
+    ):
+        client.create_scene("room")
+        client.add_references(
+            "room",
+            [NewReference(it.name, it.data, it.camera, it.world_from_camera, depth=depths[it.name]) for it in chosen],
+        )
+        (warning,) = client.get_scene("room").warnings
+        audits = {it.name.rpartition("/")[2]: it for it in client.audit_scene("room")}
+        assert warning.startswith(f"the depth of reference {chosen[2].name!r}: {MISTAKE}")
+        wrong = {name: it for name, it in audits.items() if it.verdict == "WRONG_DEPTH"}
+        assert list(wrong) == [chosen[2].name]
+        assert wrong[chosen[2].name].message.startswith(f"its depth: {MISTAKE}")
+        client.update_scene("room", arbitrary_unit=True)
+        assert not any("depth" in it for it in client.get_scene("room").warnings)
+        assert "WRONG_DEPTH" not in {it.verdict for it in client.audit_scene("room")}
