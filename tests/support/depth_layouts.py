@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import av
 import numpy as np
 import OpenEXR
 
@@ -152,6 +153,29 @@ def write_exr(file: Path, channels: Mapping[str, np.ndarray]) -> None:
     OpenEXR.File(header, dict(channels)).write(str(file))
 
 
+def stray_scanner(folder: Path) -> Path:
+    """A video of three frames, of which the odometry has numbers 0 and 2."""
+    folder.mkdir(exist_ok=True)
+    with av.open(str(folder / "rgb.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
+        for i in range(3):
+            frame = av.VideoFrame.from_ndarray(textured(seed=i), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for number, pose in zip((0, 2), TRUTH.poses, strict=True):
+        q, t = pose.quaternion(), pose.translation.tolist()
+        rows.append(", ".join([f"{100 + number / 30}", f"{number:06d}", *map(repr, [*t, q.x, q.y, q.z, q.w])]))
+    (folder / "odometry.csv").write_text("\n".join(rows) + "\n")
+    (folder / "camera_matrix.csv").write_text("80.0, 0.0, 47.75\n0.0, 81.0, 31.25\n0.0, 0.0, 1.0\n")
+    camera = CAMERA.resized(48, 32)
+    for name, file in (("depth", planted_png(camera, hole=9999)), ("confidence", png(_confidence(camera, (0, 1, 2))))):
+        (folder / name).mkdir()
+        (folder / name / "000000.png").write_bytes(file)
+    return folder
+
+
 LAYOUTS: Mapping[str, Callable[[Path], Path]] = {
     "7scenes": seven_scenes,
     "12scenes": twelve_scenes,
@@ -159,6 +183,7 @@ LAYOUTS: Mapping[str, Callable[[Path], Path]] = {
     "arkit": polycam,
     "colmap": colmap_dense,
     "record3d": record3d,
+    "stray": stray_scanner,
     "kapture": kapture,
 }
 

@@ -3,10 +3,12 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from support.depth_layouts import LAYOUTS, TRUTH, colmap_map, write_exr
 from support.depths import assert_planted, planted_depth_m, png
+from support.images import textured
 from support.layouts import CAMERA, assert_same_pose
 
 from mapless.depth import DepthSensor
@@ -242,3 +244,40 @@ def test_files_of_record3d_name_the_export_that_is_read(tmp_path: Path) -> None:
     (tmp_path / "scan.r3d").write_bytes(b"PK")
     with pytest.raises(ValueError, match="EXR"):
         read_dataset(tmp_path / "scan.r3d")
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        ("odometry.csv", "timestamp, frame, x, y\n0, 0, 0, 0\n", "z, qx, qy, qz, qw is missing"),
+        ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n0, 0, 0\n", "csv:2: expected 9 values"),
+        ("odometry.csv", "timestamp, frame, x, y, z, qx, qy, qz, qw\n0, 0, 0, 0, 0, 0, 0, 0, nan\n", "not finite"),
+        ("camera_matrix.csv", "1, 2\n3, 4\n", "K must be 3x3"),
+        ("camera_matrix.csv", "1600, 0, 960\n0, 1600, 720\n0, 0, 1\n", "not near the middle"),
+        ("rgb.mp4", "", "it is empty"),
+    ],
+)
+def test_what_is_wrong_with_all_of_stray_scanner_is_named(tmp_path: Path, file: str, content: str, said: str) -> None:
+    folder = LAYOUTS["stray"](tmp_path)
+    (folder / file).write_text(content)
+    with pytest.raises(ValueError, match=said):
+        read_dataset(folder)
+
+
+def test_stray_scanner_may_have_intrinsics_per_frame(tmp_path: Path) -> None:
+    folder = LAYOUTS["stray"](tmp_path)
+    header, *rows = (folder / "odometry.csv").read_text().splitlines()
+    rows = [f"{row}, 90.0, 91.0, 48.5, 32.5" for row in rows]
+    (folder / "odometry.csv").write_text("\n".join([f"{header}, fx, fy, cx, cy", *rows]))
+    camera = read_dataset(folder).frames[1].camera
+    assert (camera.focal_x_px, camera.focal_y_px, camera.principal_x_px) == (90.0, 91.0, 48.0)
+
+
+def test_frames_of_stray_scanner_are_joined_by_number(tmp_path: Path) -> None:
+    """The third frame of the video is the second of the odometry."""
+    folder = LAYOUTS["stray"](tmp_path)
+    dataset = read_dataset(folder)
+    assert [frame.name for frame in dataset.frames] == ["000000", "000002"]
+    shown = [np.asarray(cv2.imread(str(frame.image_path)), float) for frame in dataset.frames]
+    off = [[np.abs(it[..., ::-1] - textured(seed=seed)).mean() for seed in range(3)] for it in shown]
+    assert np.argmin(off, axis=1).tolist() == [0, 2]

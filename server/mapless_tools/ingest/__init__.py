@@ -16,6 +16,7 @@ FORMATS = {
     "icl": "icl_nuim",
     "arkit": "arkit",
     "record3d": "record3d",
+    "stray": "stray_scanner",
     "kapture": "kapture",
     "rosbag": "rosbag",
 }

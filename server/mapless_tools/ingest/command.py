@@ -76,10 +76,10 @@ def import_command(
         str, typer.Option(help="fx,fy,cx,cy in pixels, for layouts without; (0, 0) is the first pixel's centre.")
     ] = "",
     keyframe_distance: Annotated[
-        float, typer.Option(help="Of a recording: metres from one keyframe to the next; 0: all images.")
+        float, typer.Option(help="Of a recording or `stray`: metres from one keyframe to the next; 0: all images.")
     ] = 0.3,
     keyframe_angle: Annotated[
-        float, typer.Option(help="Of a recording: degrees from one keyframe to the next; 0: all images.")
+        float, typer.Option(help="Of a recording or `stray`: degrees from one keyframe to the next; 0: all images.")
     ] = 15.0,
     scale: Annotated[
         float | None, typer.Option(help="Metres per unit of the folder, where that is not the metre.")

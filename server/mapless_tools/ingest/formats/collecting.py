@@ -72,7 +72,8 @@ class ReadOptions:
         ground_truth: poses that replace the layout's own: a file or folder of SfM pseudo ground truth, for `7scenes`
             and `12scenes`.
         intrinsics: for layouts without them (`7scenes`, `tum`, recordings); None for the layout's usual ones.
-        bag, keyframes: topics, frames and images of a recording that are used; only for `rosbag`.
+        bag, keyframes: topics, frames and images of a recording that are used; only for `rosbag`, and keyframes also
+            for `stray`.
         depths: what is used of the depths of photographs.
     """
 

@@ -12,7 +12,7 @@ images' own frame (aligned), or of a frame that /tf_static connects with it.
 from __future__ import annotations
 
 import atexit
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,23 +21,19 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from mapless.geometry import RigidTransform, rotation_angle_deg
+from mapless.geometry import RigidTransform
 from mapless.ros import RosCamera, pixels_from_image
 from mapless_tools.bags import is_recording
 from mapless_tools.bags.trajectory import FrameTree
 from mapless_tools.dataset import Dataset, DepthFile
 
-from .collecting import Collector, Intrinsics, KeyframeOptions, ReadOptions
+from .collecting import Collector, Intrinsics, ReadOptions
 from .depths import FLOAT32
+from .keyframes import keyframes, sharpness
 from .writing import image_name
 
 if TYPE_CHECKING:
     from mapless_tools.bags.images import Images
-
-CANDIDATES = 5
-"""Images of which the sharpest becomes a keyframe; at 30 Hz, a sixth of a second."""
-SLACK = 0.2
-"""Tolerance of distance and angle, as a share: the candidates are no farther from the first of them."""
 
 
 def fits(path: Path) -> bool:
@@ -81,7 +77,7 @@ def read(path: Path, options: ReadOptions) -> Dataset:
                 raise ValueError(reason)
 
         photos: dict[int, _Photo] = {}
-        for stamp_ns, message, pose in keyframes(posed(), options.keyframes, refuse):
+        for stamp_ns, message, pose in keyframes(posed(), options.keyframes, _sharpness_of, refuse):
             with collector.attempt(f"{images.topic} at {images.time_s(stamp_ns):.3f} s"):
                 known = _given(options.intrinsics, message) if options.intrinsics else images.camera(stamp_ns)
                 is_undistorted = is_undistorted or known.undistortion is not None
@@ -177,53 +173,10 @@ class _Unposed:
         self.first = 0
 
 
-def keyframes(
-    images: Iterator[tuple[int, Any, RigidTransform]], options: KeyframeOptions, refuse: Callable[[int, str], None]
-) -> Iterator[tuple[int, Any, RigidTransform]]:
-    """Yields the images, with time and pose, that are far enough from the last keyframe and the sharpest nearby.
-
-    Calls `refuse`, with time and reason, for images that cannot be decoded and would have been candidates.
-    """
-    if 0 in (options.distance_m, options.angle_deg):
-        yield from images
-        return
-    last: RigidTransform | None = None
-    begin: RigidTransform | None = None
-    best: tuple[int, Any, RigidTransform] | None = None
-    sharpest, count = -1.0, 0
-    for image in images:
-        pose = image[2]
-        if best is not None and begin is not None and (count == CANDIDATES or _is_far(begin, pose, options, SLACK)):
-            yield best
-            last, best, begin = best[2], None, None
-        if best is None and last is not None and not _is_far(last, pose, options):
-            continue
-        try:
-            sharpness = sharpness_of(image[1])
-        except ValueError as error:
-            refuse(image[0], str(error))
-            continue
-        if best is None:
-            begin, sharpest, count = pose, -1.0, 0
-        count += 1
-        if sharpness > sharpest:
-            best, sharpest = image, sharpness
-    if best is not None:
-        yield best
-
-
-def sharpness_of(message: Any) -> float:
-    """Variance of the Laplacian of an image at half its size; ValueError if it cannot be decoded."""
+def _sharpness_of(message: Any) -> float:
+    """The sharpness of an image; ValueError if it cannot be decoded."""
     pixels = pixels_from_image(message)
-    grey = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
-    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(half, cv2.CV_32F).var())
-
-
-def _is_far(before: RigidTransform, now: RigidTransform, options: KeyframeOptions, share: float = 1.0) -> bool:
-    moved = before.inverse().compose(now)
-    is_away = bool(np.linalg.norm(moved.translation) >= share * options.distance_m)
-    return is_away or rotation_angle_deg(moved.rotation) >= share * options.angle_deg
+    return sharpness(pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), np.uint8))
 
 
 def _given(intrinsics: Intrinsics, message: Any) -> RosCamera:
