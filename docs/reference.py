@@ -10,7 +10,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -98,7 +98,15 @@ def reasons_table() -> str:
 
 
 def _reasons(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """Reasons and messages of the calls that make an error: `reason=` or, in the decoder, the argument IMAGE_..."""
+    """Reasons and messages of the calls that make an error: `reason=` or, in the decoder, the argument IMAGE_...
+
+    A message may be the variable of this name, which was given its text before.
+    """
+    texts = [
+        it
+        for it in ast.walk(tree)
+        if isinstance(it, ast.Assign) and isinstance(it.targets[0], ast.Name) and it.targets[0].id == "message"
+    ]
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue
@@ -106,7 +114,16 @@ def _reasons(tree: ast.Module) -> Iterator[tuple[str, str]]:
         for value in (*named, *node.args):
             for reason in _strings(value):
                 if re.fullmatch(r"[A-Z]+(_[A-Z]+)*" if value in named else r"IMAGE(_[A-Z]+)+", reason):
-                    yield reason, next((it for it in map(_message, node.args) if it), "")
+                    given = [_text_before(it, texts) for it in node.args]
+                    yield reason, next((it for it in map(_message, given) if it), "")
+
+
+def _text_before(value: ast.expr, texts: Sequence[ast.Assign]) -> ast.expr:
+    """What the variable `message` was given last before a place of the source; any other expression as it is."""
+    if not (isinstance(value, ast.Name) and value.id == "message"):
+        return value
+    before = [it for it in texts if it.lineno < value.lineno]
+    return max(before, key=lambda it: it.lineno).value if before else value
 
 
 def _strings(value: ast.expr) -> list[str]:

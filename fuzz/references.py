@@ -17,6 +17,7 @@ import numpy as np
 from google.protobuf.message_factory import GetMessageClass
 
 from mapless import wire
+from mapless.depth import DepthImage, DepthSensor, depth_to_message
 from mapless.geometry import RigidTransform
 from mapless.names import check_id
 from mapless.scenes import UNCHANGED
@@ -34,6 +35,7 @@ from mapless_server.security import Principal, SceneKey, key_of, scene_id_of, te
 from mapless_server.services import references as reference_service
 from mapless_server.services.messages.references import MAX_PAGE_SIZE
 from mapless_server.store import NewReference, ReferenceRecord, SceneAttributes, SceneRecord, codec, rows
+from mapless_server.store.depth_images import decode_depth_image, encode_depth_image
 
 from . import messages
 from .laws import answered, check_pose, check_received_camera
@@ -45,6 +47,7 @@ METHODS = {GetMessageClass(method.input_type): method.name for method in _SERVIC
 KINDS = tuple(METHODS)
 TENANT = "acme"
 NOTHING_KNOWN = SceneAttributes()
+DEPTH = DepthImage.of_metres(np.full((CAMERA.height_px, CAMERA.width_px), 2.0, np.float32), DepthSensor.STEREO)
 _NOW = datetime(2026, 11, 21, tzinfo=timezone.utc)
 _VIEW = View(CAMERA, Features(np.ones((2, 2), np.float32), np.ones((2, 4), np.float32), np.ones(2, np.float32)))
 
@@ -196,6 +199,8 @@ def _stored(key: SceneKey, new: NewReference) -> ReferenceRecord:
     camera, pose, provenance = codec.decode_geometry(record.key, row["geometry"], row["geometry_sha256"])
     assert (camera, provenance) == (new.camera, new.provenance)
     assert (pose.matrix() == new.world_from_camera.matrix()).all()
+    if new.depth is not None:
+        assert decode_depth_image(encode_depth_image(new.depth), record.depth_sha256).sha256 == record.depth_sha256
     return record
 
 
@@ -248,6 +253,9 @@ def seeds() -> tuple[bytes, ...]:
     create = pb.CreateReferenceRequest(
         scene=scene, reference_id="r0", reference=pb.Reference(world_from_camera=pose, **photo)
     )
+    deep = pb.CreateReferenceRequest()
+    deep.CopyFrom(create)
+    deep.reference.depth.CopyFrom(depth_to_message(DEPTH))
     batch = pb.BatchCreateReferencesRequest(scene=scene, requests=[create, create])
     batch.requests[1].reference_id = "r1"
     retrieve = pb.RetrieveReferencesRequest(scene=scene, count=5, **photo)
@@ -260,6 +268,7 @@ def seeds() -> tuple[bytes, ...]:
         pb.ListScenesRequest(page_size=2, page_token=_token(pb.ListScenesRequest(page_size=2))),
         pb.DeleteSceneRequest(name=scene),
         create,
+        deep,
         batch,
         pb.GetReferenceRequest(name=reference, include_image=True),
         pb.ListReferencesRequest(

@@ -14,6 +14,7 @@ Mutator = Callable[[bytes, Random, MutateBytes], bytes]
 TARGETS = {
     "images": "image decoding",
     "exif": "image decoding",
+    "depth": "image decoding",
     "localization": "request validation",
     "references": "request validation",
     "metadata": "request validation",
