@@ -193,6 +193,12 @@ class Debug:
     reference_px: Array
     source: NDArray[np.str_] = field(default_factory=lambda: np.empty(0, np.str_))
 
+    @property
+    def is_by_depth(self) -> NDArray[np.bool_]:
+        """(M,) whether a depth gives the point its distance; False of servers older than 0.4."""
+        return self.source != "TRIANGULATED" if len(self.source) else np.zeros(len(self.is_inlier), bool)
+
     def inliers_by_source(self) -> dict[str, int]:
         """Number of inliers of each source that a match has; empty from servers older than 0.4."""
-        return {str(it): int(self.is_inlier[self.source == it].sum()) for it in np.unique(self.source)}
+        sources = sorted(np.unique(self.source).tolist(), key=lambda it: it != "TRIANGULATED")
+        return {it: int(self.is_inlier[self.source == it].sum()) for it in sources}

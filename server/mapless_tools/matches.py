@@ -80,6 +80,15 @@ class Shot:
         return _moved(pixels, self.camera.width_px / camera.width_px, self.camera.height_px / camera.height_px)
 
 
+def colours_at(picture: Picture, camera: Camera, pixels: Array) -> NDArray[np.uint8]:
+    """Colours (N, 3) of a reduced photograph at pixels (N, 2) of the whole one."""
+    height, width = picture.shape[:2]
+    scale_x, scale_y = width / camera.width_px, height / camera.height_px
+    column = resized_pixel(pixels[:, 0], scale_x).round().astype(int)
+    row = resized_pixel(pixels[:, 1], scale_y).round().astype(int)
+    return np.asarray(picture[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], np.uint8)
+
+
 def source_colours(debug: Debug) -> list[str]:
     """The colour (M,) of each match as one that agrees with the pose."""
     return [SOURCE_COLOURS.get(it, ("", GOOD))[1] for it in debug.source] or [GOOD] * len(debug.is_inlier)

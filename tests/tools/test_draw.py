@@ -103,7 +103,7 @@ class TestPage:
             "hall.jpg: localized",
             "(180)",
             "130 triangulated",
-            "blue: by measured depth (50)",
+            "50 blue, by measured depth",
             "4.00e-04",
             "id-1",
             "radial_tangential: k1 -0.1",

@@ -6,12 +6,14 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
+import pygltflib
 import pytest
 from support.images import encode, textured
 from support.layouts import CAMERA, truth
 
 from mapless import Datum, Reference, Scene
 from mapless.geometry import Array
+from mapless_tools.depth_points import ColouredPoints
 from mapless_tools.ingest.gltf import View, to_gltf
 
 trimesh = pytest.importorskip("trimesh")
@@ -29,7 +31,8 @@ def views() -> list[View]:
         reference = Reference("s", f"r{i}", camera, pose.shifted(FAR), "", 9, NOW)
         points = pose.shifted(FAR).apply(np.array([[0.0, 0.0, 2.0], [0.5, 0.25, 3.0]]))
         colours = np.array([[255, 0, 0], [0, 128, 255]], np.uint8)
-        found.append(View(reference, encode(".jpg", textured(64, 48, seed=i)), points, colours))
+        shared = ColouredPoints(points, colours)
+        found.append(View(reference, encode(".jpg", textured(64, 48, seed=i)), shared))
     return found
 
 
@@ -52,8 +55,26 @@ def test_cameras_and_points_are_where_they_are() -> None:
         expected = view.reference.world_from_camera.shifted(-origin).matrix() @ np.diag([1, -1, -1, 1])
         np.testing.assert_allclose(found, expected, atol=1e-9)
     (points,) = (it for it in scene.geometry.values() if isinstance(it, trimesh.PointCloud))
-    np.testing.assert_allclose(points.vertices, np.concatenate([it.points for it in views()]) - origin, atol=1e-5)
+    np.testing.assert_allclose(
+        points.vertices, np.concatenate([it.points.points for it in views() if it.points]) - origin, atol=1e-5
+    )
     np.testing.assert_array_equal(points.colors[:2], [[255, 0, 0, 255], [0, 56, 255, 255]])
+
+
+def test_points_of_depth_are_nodes_of_their_own() -> None:
+    """So viewers can hide them; their material is bluish, their colours are those of the photograph."""
+    first, *others = views()
+    assert first.points is not None
+    given = [replace(first, by_depth=first.points, depth=first.points), *others]
+    scene = loaded(Scene("s", 1, 4, NOW, down_in_world=DOWN), given)
+    clouds = {name: it for name, it in scene.geometry.items() if isinstance(it, trimesh.PointCloud)}
+    assert set(clouds) == {"points", "points by depth", f"depth of {first.reference.reference_id}"}
+    for name in set(clouds) - {"points"}:
+        np.testing.assert_array_equal(clouds[name].vertices, clouds["points"].vertices[:2])
+    file = pygltflib.GLTF2.load_from_bytes(to_gltf(Scene("s", 1, 4, NOW), given))
+    used = {mesh.name: file.materials[mesh.primitives[0].material].name for mesh in file.meshes}
+    assert used["points"] == "points"
+    assert used["points by depth"] == used[f"depth of {first.reference.reference_id}"] == "points by depth"
 
 
 def test_a_frustum_meets_the_corners_of_the_photograph() -> None:

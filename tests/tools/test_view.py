@@ -19,9 +19,10 @@ from mapless.answers import Accuracy, Hint, Hypothesis, LocalizationResult, Reje
 from mapless.diagnostics import Debug, Diagnostics, ReferenceUse
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_tools.cli.app import app
-from mapless_tools.matches import read_picture
+from mapless_tools.depth_points import ColouredPoints
+from mapless_tools.matches import colours_at, read_picture
 from mapless_tools.view.drawing import ellipsoid
-from mapless_tools.view.feed import Query, colours_at
+from mapless_tools.view.feed import Query
 from mapless_tools.view.scenery import lay_out, spread_out
 
 CAMERA = Camera(1800, 1350, 1500.0, 1500.0, 899.5, 674.5)
@@ -216,7 +217,8 @@ def test_queries_of_every_outcome_come_and_go() -> None:
     x = upright(0).apply(random.uniform((-2, -1.5, 4), (2, 1.5, 6), (40, 3)))
     pixels = CAMERA.project(upright(0).inverse().apply(x))
     image = encode(".png", np.full((1350, 1800, 3), 90, np.uint8))
-    debug = Debug(pixels, x, np.arange(40) % 5 != 0, np.zeros(40), np.zeros(40, int), pixels)
+    source = np.where(np.arange(40) % 2, "TRIANGULATED", "MEASURED_DEPTH")
+    debug = Debug(pixels, x, np.arange(40) % 5 != 0, np.zeros(40), np.zeros(40, int), pixels, source)
     hypotheses = (Hypothesis(upright(0), 9, ()), Hypothesis(upright(3), 8, ()))
     lost = query(None, debug, image)
     assert isinstance(lost.answer, Rejected)
@@ -229,15 +231,23 @@ def test_queries_of_every_outcome_come_and_go() -> None:
         stage.show_picture("r4", read_picture(image, 160))
         for number in range(MAX_QUERIES + 5):
             stage.show_query(replace(outcomes[number % 4], number=number + 1))
-        stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
-        stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8))
+        for _ in range(2):
+            stage.show_points(debug.x_in_world, np.zeros((40, 3), np.uint8), debug.is_by_depth)
+        stage.show_depth("r4", ColouredPoints(debug.x_in_world, np.zeros((40, 3), np.uint8)))
         stage.report("live", True)
         assert "None yet" in stage._nothing.content
         stage.report("not shown", False)
         assert "yet" not in stage._nothing.content
-        names = {name for name in server.scene._handle_from_node_name if name.startswith("/queries/")}
+        handles: dict[str, Any] = dict(server.scene._handle_from_node_name)
+        names = {name for name in handles if name.startswith("/queries/")}
+        counts = {name: len(handles[name].points) for name in ("/points", "/points-by-depth", "/depth/0-r4")}
+        setattr(stage._show_depths, "value", False)  # noqa: B010 - its type says that it is only read
+        stage._show_clouds()
+        shown = {name: handles[name].visible for name in counts}
     finally:
         server.stop()
+    assert counts == {"/points": 20, "/points-by-depth": 20, "/depth/0-r4": 40}
+    assert shown == {"/points": True, "/points-by-depth": False, "/depth/0-r4": False}
     kept = range(6, MAX_QUERIES + 6)
     cameras = {1: 1, 2: 1, 3: 0, 0: 2}
     assert {it for it in names if "/camera-" in it} == {

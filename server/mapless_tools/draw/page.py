@@ -124,8 +124,8 @@ def _photograph(answer: Answer, image: bytes, camera: Camera) -> Figure:
         caption = f"{count}, no pose was accepted."
     elif factor > 1:
         caption += f" Lines lead to the projections of their points, those of dots drawn {factor} times as long."
-    if sources := [f"{_source(it)} ({count})" for it, count in debug.inliers_by_source().items()]:
-        caption += f" Dots are {', '.join(sources)}."
+    if sources := [f"{count} {_source(it)}" for it, count in debug.inliers_by_source().items()]:
+        caption += f" Of the dots are {'; '.join(sources)}."
     return Figure(caption, data_uri(rendered(axes.figure)))
 
 
@@ -254,7 +254,7 @@ def _sources(debug: Debug | None) -> list[list[str]]:
 
 def _source(name: str) -> str:
     """A source of points, with its colour."""
-    return f"{SOURCE_COLOURS[name][0]}: {POINT_SOURCES[name]}" if name in SOURCE_COLOURS else name
+    return f"{SOURCE_COLOURS[name][0]}, {POINT_SOURCES[name]}" if name in SOURCE_COLOURS else name
 
 
 def _hypotheses(answer: Rejected) -> list[list[str]]:

@@ -1,8 +1,10 @@
-"""A scene as one binary glTF file: cameras as frusta with small photographs, and points that they share.
+"""A scene as one binary glTF file: cameras as frusta with small photographs, and points: shared ones, and of depth.
 
 Any viewer can show it. The root node rotates the scene's world to glTF's axes (y up); below it, positions are relative
 to the middle of the scene, so that single precision is enough. Each reference is a node with glTF's axes of cameras (x
-right, y up, z back); `extras` have the reference's id, camera and pose, and the scene's datum, down and unit.
+right, y up, z back); `extras` have the reference's id, camera and pose, and the scene's datum, down and unit. Points
+are nodes beside: `points` are triangulated, `points by depth` matched with a depth, and `depth of ID` is the depth that
+a reference came with, thinned. The latter two have a bluish material, and viewers can hide nodes.
 """
 
 from collections.abc import Sequence
@@ -20,6 +22,8 @@ from mapless import Scene as KnownScene
 from mapless.geometry import Array, Quaternion, RigidTransform
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ANY_SIZE, decode_image
+from mapless_tools.depth_points import ColouredPoints, depth_points, share_of
+from mapless_tools.matches import colours_at
 from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 from mapless_tools.view.scenery import Scenery, lay_out
@@ -32,6 +36,10 @@ PICTURES, THUMBNAIL_PX = 200, 128
 POINT_SOURCES = 40
 """References that are localized among the others for the points that they share; each takes as long as a query."""
 _LINE_COLOUR = [0.2, 0.5, 1.0, 1.0]
+_DEPTH_COLOUR = [0.55, 0.8, 1.0, 1.0]
+"""By which the colours of points by depth are multiplied."""
+_POINTS, _DEPTH = 1, 2
+"""Materials of points."""
 _GAMMA = 2.2
 """Gamma of photographs; colours of points are linear in glTF."""
 _UNLIT = "KHR_materials_unlit"
@@ -39,28 +47,39 @@ _UNLIT = "KHR_materials_unlit"
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A reference, its small photograph (JPEG), and the points (N, 3) in the world, with colours, that it shows."""
+    """A reference as it is drawn.
+
+    Attributes:
+        reference: its camera and pose.
+        thumbnail: its small photograph, JPEG.
+        points: triangulated points that it shows.
+        by_depth: points that it matches, whose distance a depth gives.
+        depth: its own depth.
+    """
 
     reference: Reference
     thumbnail: bytes | None = None
-    points: Array | None = None
-    colours: NDArray[np.uint8] | None = None
+    points: ColouredPoints | None = None
+    by_depth: ColouredPoints | None = None
+    depth: ColouredPoints | None = None
 
 
 def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) -> Export:
     """Writes SCENE.glb into a folder; see `export_scene`."""
     known = client.get_scene(scene)
     left = iter(range(POINT_SOURCES))
+    share = share_of(min(known.reference_count, PICTURES))
 
     def take(reference: Reference) -> View:
         if reference.image is None:
             return View(reference)
         try:
-            image = np.ascontiguousarray(decode_image(reference.image, ANY_SIZE)[..., ::-1])
+            image = decode_image(reference.image, ANY_SIZE)
         except InvalidArgument:
             return View(reference)
         points = _points(client, scene, reference, image) if next(left, None) is not None else (None, None)
-        return View(reference, thumbnail(image), *points)
+        small = thumbnail(np.ascontiguousarray(image[..., ::-1]))
+        return View(reference, small, *points, depth_points(reference, image, share))
 
     views, damaged = fetch_all(client, scene, take, progress, PICTURES)
     if views:
@@ -79,8 +98,8 @@ def thumbnail(image: NDArray[np.uint8]) -> bytes:
 
 def _points(
     client: Client, scene: str, reference: Reference, image: NDArray[np.uint8]
-) -> tuple[Array, NDArray[np.uint8]] | tuple[None, None]:
-    """Points in the world that a photograph shares with others, with colours; None without any, or after a failure."""
+) -> tuple[ColouredPoints | None, ColouredPoints | None]:
+    """Points that a photograph (H, W, 3) RGB shares with others, triangulated and by depth; None after a failure."""
     try:
         answer = client.localize(reference.image or b"", reference.camera, scene, include_debug=True)
     except MaplessError:
@@ -88,10 +107,10 @@ def _points(
     if not isinstance(answer, LocalizationResult) or answer.debug is None:
         return None, None
     debug = answer.debug
-    agrees = debug.is_inlier
-    column, row = np.rint(debug.query_px[agrees]).astype(int).T
-    colours = image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1), ::-1]
-    return debug.x_in_world[agrees], colours
+    colours = colours_at(image, reference.camera, debug.query_px)
+    kinds = debug.is_inlier & ~debug.is_by_depth, debug.is_inlier & debug.is_by_depth
+    triangulated, by_depth = (ColouredPoints(debug.x_in_world[it], colours[it]) for it in kinds)
+    return triangulated, by_depth
 
 
 def to_gltf(scene: KnownScene, views: Sequence[View]) -> bytes:
@@ -100,9 +119,10 @@ def to_gltf(scene: KnownScene, views: Sequence[View]) -> bytes:
     file = _File(scene, scenery)
     for view in views:
         file.add_camera(view)
-    seen = [(it.points, it.colours) for it in views if it.points is not None and it.colours is not None]
-    if any(len(points) for points, _ in seen):
-        file.add_points(np.concatenate([it for it, _ in seen]), np.concatenate([it for _, it in seen]))
+    file.add_points("points", [it.points for it in views], _POINTS)
+    file.add_points("points by depth", [it.by_depth for it in views], _DEPTH)
+    for view in views:
+        file.add_points(f"depth of {view.reference.reference_id}", [view.depth], _DEPTH)
     return file.content()
 
 
@@ -127,6 +147,7 @@ class _File:
             materials=[
                 _material("lines", baseColorFactor=_LINE_COLOUR),
                 _material("points", baseColorFactor=[1.0, 1.0, 1.0, 1.0]),
+                _material("points by depth", baseColorFactor=_DEPTH_COLOUR),
             ],
             extensionsUsed=[_UNLIT],
         )
@@ -156,13 +177,18 @@ class _File:
         )
         self._in_world.append(self._node(node))
 
-    def add_points(self, points: Array, colours: NDArray[np.uint8]) -> None:
+    def add_points(self, name: str, given: Sequence[ColouredPoints | None], material: int) -> None:
+        """Adds a node with all these points, if there are any."""
+        some = [it for it in given if it is not None and len(it.points)]
+        if not some:
+            return
+        points, colours = (np.concatenate([getattr(it, part) for it in some]) for part in ("points", "colours"))
         positions = self._array((points - self._scenery.origin).astype(np.float32), gl.FLOAT, "VEC3")
         linear = np.rint(255 * (colours / 255) ** _GAMMA).astype(np.uint8)
         rgba = np.concatenate([linear, np.full((len(colours), 1), 255, np.uint8)], axis=1)  # four bytes: aligned
         colour = self._array(rgba, gl.UNSIGNED_BYTE, "VEC4", normalized=True)
-        mesh = self._mesh("points", gl.Attributes(POSITION=positions, COLOR_0=colour), gl.POINTS, material=1)
-        self._in_world.append(self._node(gl.Node(name="points", mesh=mesh)))
+        mesh = self._mesh(name, gl.Attributes(POSITION=positions, COLOR_0=colour), gl.POINTS, material)
+        self._in_world.append(self._node(gl.Node(name=name, mesh=mesh)))
 
     def content(self) -> bytes:
         self._gltf.buffers = [gl.Buffer(byteLength=len(self._blob))]

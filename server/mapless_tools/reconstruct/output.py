@@ -19,6 +19,7 @@ from mapless.geometry import Camera
 from mapless.lenses import lens_model_of
 from mapless_server.method.features.views import MAX_INCIDENCE_DEG, undistort_pixels
 from mapless_tools.charts import figure_of, inline_svg, new_axes
+from mapless_tools.depth_points import ColouredPoints
 from mapless_tools.ingest.formats.writing import IMAGES, PosedImage, cameras_files
 from mapless_tools.ingest.gltf import PICTURES, View, thumbnail, to_gltf
 from mapless_tools.output_files import render
@@ -95,7 +96,8 @@ def _views(part: Part) -> list[View]:
         if i:
             views.append(View(reference, picture))
         else:
-            views.append(View(reference, picture, part.points_in_world, np.rint(part.colours).astype(np.uint8)))
+            colours = np.rint(part.colours).astype(np.uint8)
+            views.append(View(reference, picture, ColouredPoints(part.points_in_world, colours)))
     return views
 
 

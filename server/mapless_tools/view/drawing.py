@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mapless.answers import LocalizationResult
 from mapless.geometry import Array, Camera, RigidTransform
-from mapless_tools.matches import GOOD, WRONG, Picture
+from mapless_tools.matches import GOOD, SOURCE_COLOURS, WRONG, Picture
 
 from .scenery import Scenery
 
@@ -68,6 +68,8 @@ REFERENCE, OTHER, QUERY, SELECTED, DOUBT = (
 )
 """Colours of references, of those drawn as dots, of queries, of the selected one, and of poses that contradict each
 other."""
+TINT = 0.35
+"""Share of the tint in the colour of a point by depth."""
 MAX_RAYS = 90
 """Lines from a query to its points; more hide what they lead to."""
 
@@ -75,6 +77,15 @@ MAX_RAYS = 90
 def _rgb(colour: str) -> Colour:
     red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue
+
+
+BY_DEPTH = _rgb(SOURCE_COLOURS["MEASURED_DEPTH"][1])
+"""Colour of lines to points by depth, and tint of these."""
+
+
+def tinted(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Colours (N, 3) of points by depth, between their own and that of points by depth."""
+    return np.asarray((1 - TINT) * colours + TINT * np.array(BY_DEPTH), np.uint8)
 
 
 class Drawing:
@@ -155,9 +166,10 @@ class Drawing:
             return []
         centre, longest_m = self._scenery.placed(answer.world_from_camera).translation, 1.5 * self._scenery.extent_m
         points, right = answer.debug.x_in_world - self._scenery.origin, answer.debug.is_inlier
-        drawn = []
+        by_depth, drawn = answer.debug.is_by_depth, []
         for kind, rows, colour, count in (
-            ("right", right, _rgb(GOOD), MAX_RAYS),
+            ("right", right & ~by_depth, _rgb(GOOD), MAX_RAYS),
+            ("right-by-depth", right & by_depth, BY_DEPTH, MAX_RAYS),
             ("wrong", ~right, _rgb(WRONG), MAX_RAYS // 4),
         ):
             lines = rays(centre, points[rows], count, longest_m)

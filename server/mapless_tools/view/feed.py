@@ -8,20 +8,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import grpc
-import numpy as np
-from numpy.typing import NDArray
 
 from mapless import ConnectOptions, MaplessError, wire
 from mapless.addresses import addresses_of
 from mapless.answers import LocalizationResult, Rejected
 from mapless.errors import from_rpc_error
-from mapless.geometry import Array, Camera, RigidTransform, resized_pixel
+from mapless.geometry import Camera, RigidTransform
 from mapless.messages import answer_from_message
 from mapless.names import scene_name
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.wire import FieldError
-from mapless_tools.matches import Picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,15 +51,6 @@ def _length(metres: float) -> str:
 
 
 THUMBNAIL_PX = 160
-
-
-def colours_at(picture: Picture, camera: Camera, pixels: Array) -> NDArray[np.uint8]:
-    """Colours (N, 3) of a reduced photograph at pixels (N, 2) of the whole one."""
-    height, width = picture.shape[:2]
-    scale_x, scale_y = width / camera.width_px, height / camera.height_px
-    column = resized_pixel(pixels[:, 0], scale_x).round().astype(int)
-    row = resized_pixel(pixels[:, 1], scale_y).round().astype(int)
-    return np.asarray(picture[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], np.uint8)
 
 
 log = logging.getLogger(__name__)

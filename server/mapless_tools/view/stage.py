@@ -15,23 +15,24 @@ from mapless import Reference
 from mapless.answers import Rejected
 from mapless.geometry import Array
 from mapless.names import reference_name
+from mapless_tools.depth_points import ColouredPoints
 from mapless_tools.draw.page import answer_page, best_references
 from mapless_tools.matches import Picture, read_picture
 
-from .drawing import DOUBT, OTHER, QUERY, REFERENCE, SELECTED, Drawing
+from .clouds import Cloud
+from .drawing import DOUBT, OTHER, QUERY, REFERENCE, SELECTED, Drawing, tinted
 from .feed import THUMBNAIL_PX, Query
 from .guarded import GuardedViser
 from .scenery import Scenery
 
 MAX_QUERIES = 12
 """Queries that are kept; each has its photograph in memory."""
-MAX_POINTS = 150_000
 REFERENCE_PX = 1200
 """Longer side of a reference's photograph in its dialogue, at most."""
 _QUERY_SIZE = 1.5
 """Size of a query's frustum, relative to those of references."""
-_VOXEL_SHARE, _POINT_SHARE = 0.002, 0.004
-"""Shares of the scene's extent: points nearer than this to one another are shown as one; and how large one is."""
+DEPTH_POINT_SHARE = 0.0025
+"""Size of a point of a reference's depth, as a share of the scene's extent: smaller than matched ones."""
 _FOUND, _LOST = (72, 84, 96), (178, 84, 36)
 """Colours of the buttons of queries."""
 _NONE_YET = "None yet. They appear here as the server answers them."
@@ -59,8 +60,9 @@ class Stage:
         self._lock = threading.Lock()
         self._shown: deque[_Shown] = deque()
         self._selected: _Shown | None = None
-        self._points: dict[bytes, tuple[Array, NDArray[np.uint8]]] = {}
-        self._cloud: Any = None
+        self._points = Cloud(self._drawing, "/points", scenery.extent_m)
+        self._depth_points = Cloud(self._drawing, "/points-by-depth", scenery.extent_m)
+        self._depths: list[Any] = []
         pictured = [(int(i), scenery.references[i]) for i in scenery.pictured]
         self._references = {it.reference_id: self._draw_reference(i, it) for i, it in pictured}
         self._dots = self._draw_others()
@@ -76,22 +78,20 @@ class Stage:
         """Shows a photograph on a reference's frustum."""
         self._references[reference_id].image = picture
 
-    def show_points(self, points: Array, colours: NDArray[np.uint8]) -> None:
-        """Adds points (N, 3) of the world with colours (N, 3)."""
-        extent_m = self._scenery.extent_m
+    def show_points(self, points: Array, colours: NDArray[np.uint8], by_depth: NDArray[np.bool_]) -> None:
+        """Adds matched points (N, 3) of the world with colours (N, 3), and whether a depth gives their distance."""
         placed = points - self._scenery.origin
-        cells = np.round(placed / (_VOXEL_SHARE * extent_m)).astype(np.int64)
         with self._lock:
-            before = len(self._points)
-            for cell, point, colour in zip(cells, placed, colours, strict=True):
-                if len(self._points) < MAX_POINTS:
-                    self._points.setdefault(cell.tobytes(), (point, colour))
-            if len(self._points) == before:
-                return
-            all_points = np.stack([point for point, _ in self._points.values()])
-            all_colours = np.stack([colour for _, colour in self._points.values()])
-            visible = self._show_points.value
-            self._cloud = self._drawing.points("/points", all_points, all_colours, _POINT_SHARE * extent_m, visible)
+            self._points.add(placed[~by_depth], colours[~by_depth], self._show_points.value)
+            self._depth_points.add(placed[by_depth], tinted(colours[by_depth]), self._show_depths.value)
+
+    def show_depth(self, reference_id: str, found: ColouredPoints) -> None:
+        """Shows the depth of a reference."""
+        placed, size_m = found.points - self._scenery.origin, DEPTH_POINT_SHARE * self._scenery.extent_m
+        with self._lock:
+            name = f"/depth/{len(self._depths)}-{reference_id}"
+            visible = self._show_depths.value
+            self._depths.append(self._drawing.points(name, placed, tinted(found.colours), size_m, visible))
 
     def show_query(self, query: Query) -> None:
         """Adds a query, and selects it."""
@@ -192,12 +192,14 @@ class Stage:
         with gui.add_folder("Show", order=1):
             show_references = gui.add_checkbox("References", True)
             self._show_points = gui.add_checkbox("Points", True)
+            self._show_depths = gui.add_checkbox("Points by depth", True)
             self._show_matches = gui.add_checkbox("Matches of the selected query", True)
             self._size = gui.add_slider("Size of cameras", 0.2, 3.0, 0.1, 1.0)
         with gui.add_folder("Queries", order=2) as self._list:
             self._nothing = gui.add_markdown(_NONE_YET)
         show_references.on_update(lambda _: self._show_references(show_references.value))
-        self._show_points.on_update(lambda _: self._show_cloud())
+        for box in (self._show_points, self._show_depths):
+            box.on_update(lambda _: self._show_clouds())
         self._show_matches.on_update(lambda _: self._select(self._selected) if self._selected else None)
         self._size.on_update(lambda _: self._resize())
 
@@ -205,10 +207,12 @@ class Stage:
         for handle in (*self._references.values(), *self._dots):
             handle.visible = visible
 
-    def _show_cloud(self) -> None:
+    def _show_clouds(self) -> None:
         with self._lock:
-            if self._cloud is not None:
-                self._cloud.visible = self._show_points.value
+            self._points.show(self._show_points.value)
+            self._depth_points.show(self._show_depths.value)
+            for handle in self._depths:
+                handle.visible = self._show_depths.value
 
     def _resize(self) -> None:
         size = float(self._size.value) * self._scenery.size_m

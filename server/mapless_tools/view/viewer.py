@@ -12,9 +12,10 @@ import numpy as np
 
 from mapless import Client, ConnectOptions, MaplessError, Reference
 from mapless_server.errors import InvalidArgument
-from mapless_tools.matches import read_picture
+from mapless_tools.depth_points import depth_points, share_of
+from mapless_tools.matches import colours_at, read_picture
 
-from .feed import THUMBNAIL_PX, Feed, Query, colours_at
+from .feed import THUMBNAIL_PX, Feed, Query
 from .guarded import GuardedViser
 from .scenery import Scenery, lay_out
 from .stage import Stage
@@ -92,8 +93,13 @@ class _Background:
                 log.warning("%s", error)
 
     def _load(self, reference: Reference) -> None:
-        image = self._client.get_reference(self._scene, reference.reference_id, include_image=True).image or b""
-        self._stage.show_picture(reference.reference_id, read_picture(image, THUMBNAIL_PX))
+        stored = self._client.get_reference(self._scene, reference.reference_id, include_image=True)
+        picture = read_picture(stored.image or b"", 4 * THUMBNAIL_PX)
+        small = read_picture(stored.image or b"", THUMBNAIL_PX)
+        self._stage.show_picture(reference.reference_id, small)
+        found = depth_points(stored, picture, share_of(len(self._scenery.pictured)))
+        if found is not None:
+            self._stage.show_depth(reference.reference_id, found)
 
     def _seed(self, feed: Feed, index: int) -> None:
         """Localizes a reference against its neighbours, for their common points."""
@@ -112,4 +118,5 @@ class _Background:
             return
         picture = read_picture(query.image, 4 * THUMBNAIL_PX)
         good = np.flatnonzero(debug.is_inlier)
-        self._stage.show_points(debug.x_in_world[good], colours_at(picture, query.camera, debug.query_px[good]))
+        colours = colours_at(picture, query.camera, debug.query_px[good])
+        self._stage.show_points(debug.x_in_world[good], colours, debug.is_by_depth[good])
