@@ -144,20 +144,21 @@ def compared(search: Search) -> Search:
         return search
     pairs = zip(material.references, material.query_matches, strict=True)
     found = [similarity_of(material.view, reference.view, matches) for reference, matches in pairs]
-    agreement = max(search.agreement, agreement_of(found, material, search.query.is_part))
+    is_enough = search.query.is_part or search.query.photo.depth is not None
+    agreement = max(search.agreement, agreement_of(found, material, is_enough))
     search = replace(search, agreement=agreement)
     is_upright = search.attempt.raster is Raster.AS_IS
     return replace(search, angles_deg=_rasters_by(search, material, found)) if is_upright else search
 
 
-def agreement_of(found: Sequence[Similarity | None], material: Material, is_part: bool) -> float:
+def agreement_of(found: Sequence[Similarity | None], material: Material, is_enough: bool) -> float:
     """The agreement that as many references reach as a pose needs: two.
 
     One that has depths is enough, and so is one for a rig's or sequence's photograph, which others help; chance reaches
     more with one of many than with two.
     """
     agreements = [it.agreement if it else 0.0 for it in found]
-    alone = [a for a, it in zip(agreements, material.references, strict=True) if is_part or it.depths is not None]
+    alone = [a for a, it in zip(agreements, material.references, strict=True) if is_enough or it.depths is not None]
     _, second, *_ = sorted([*agreements, 0.0, 0.0], reverse=True)
     return max([second, *(it - ALONE_BY_CHANCE for it in alone)])
 

@@ -8,11 +8,16 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Camera
 from mapless_server.images import ImageLimits, decode_image, upright_of
 from mapless_server.method.features.extractors import FeatureExtractor, Mirrors
 from mapless_server.method.features.extractors.turned import extract_upright
 from mapless_server.method.features.views import Photograph, View, reduce_image
 from mapless_server.method.options import StageContext
+from mapless_server.method.structure.measured_depth import MeasuredDepth
 
 from .query import Photo
 
@@ -40,6 +45,7 @@ class _Decoded:
         self.views: dict[tuple[str, RasterForm], View] = {}
         self._photo, self._limits = photo, limits
         self._photograph: Photograph | None = None
+        self._depth: NDArray[np.float32] | None = None
 
     @cached_property
     def upright_deg(self) -> float:
@@ -54,8 +60,17 @@ class _Decoded:
                 pixels = decode_image(photo.image, self._limits, photo.field)
                 ignored = photo.read_ignored(self._limits)
             identify = lambda: hashlib.sha256(photo.image).hexdigest()  # noqa: E731
-            self._photograph = Photograph(identify, photo.camera, lambda: pixels, lambda: ignored)
+            read_depth = None if photo.depth is None else self._read_depth
+            self._photograph = Photograph(
+                identify, photo.camera, lambda: pixels, lambda: ignored, read_depth=read_depth
+            )
         return self._photograph
+
+    def _read_depth(self, camera: Camera) -> MeasuredDepth:
+        assert self._photo.depth is not None
+        if self._depth is None:
+            self._depth = self._photo.read_depth(self._limits)
+        return MeasuredDepth.of(self._photo.depth, self._depth, camera)
 
 
 class QueryViews:

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapless_server import __version__
-from mapless_server.images import ImageLimits, decode_mask
+from mapless_server.images import ImageLimits, decode_depth, decode_mask
 from mapless_server.method.bundle.priors import NO_PRIORS, Priors
 from mapless_server.method.options import ChosenCamera, Variant
 from mapless_server.store import SceneAttributes, calibration_kind
 
 if TYPE_CHECKING:  # services need not load what computes
+    from numpy.typing import NDArray
+
     from mapless.depth import DepthImage
     from mapless.geometry import Camera
     from mapless_server.images.exif import Exif
@@ -59,6 +61,12 @@ class Photo:
             return None
         size = self.camera.width_px, self.camera.height_px
         return decode_mask(self.mask, size, limits, self.mask_field)
+
+    def read_depth(self, limits: ImageLimits) -> NDArray[np.float32]:
+        """Decodes the depth (H, W), in the unit of poses, NaN where there is none; InvalidArgument if it is bad."""
+        assert self.depth is not None
+        size = self.camera.width_px, self.camera.height_px
+        return decode_depth(self.depth, size, limits, self.field.removesuffix("image") + "depth")
 
     @property
     def mask_field(self) -> str:

@@ -29,6 +29,7 @@ def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions)
         can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),
         any_roll=any_roll_of(tiers),
         angles_deg=search.angles_deg,
+        has_depth=query.photo.depth is not None and search.coarse is not None,
         known=_known(search),
         promise=promise,
     )

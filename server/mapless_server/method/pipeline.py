@@ -9,9 +9,11 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
 
+import numpy as np
+
 from mapless.geometry import Array
 
-from .bundle.estimate import PoseStage, Support
+from .bundle.estimate import NO_DEPTH, DepthCheck, PosedSupport, PoseStage, Support
 from .bundle.pose_problem import AdjustOptions
 from .bundle.priors import NO_PRIORS, Priors
 from .coarse import Outcome, Reconstructor, Request, Triangulation, reconstruct_one
@@ -161,8 +163,17 @@ class Coarse:
         inliers = support.inliers_by_reference() if support else (0,) * len(prepared.references)
         seconds = dict(prepared.context.stage_seconds)
         stationary_count = prepared.correspondences.stationary_count
-        made = Answer(outcome, scale, seconds, matches, inliers, support, stationary_count)
+        check = _depth_check(prepared.query, support)
+        made = Answer(outcome, scale, seconds, matches, inliers, support, stationary_count, check)
         return shifted(made, prepared.origin)
+
+
+def _depth_check(query: View, support: Support | None) -> DepthCheck:
+    """How the query's depth compares with the pose of a support, if it has one; without counts without depth."""
+    if query.depths is None:
+        return NO_DEPTH
+    check = support.estimate.depth_check if isinstance(support, PosedSupport) else None
+    return check or DepthCheck(int(np.isfinite(query.depths.depth).sum()))
 
 
 def prepare(
@@ -189,6 +200,9 @@ def prepare(
     origin = references[0].world_from_camera.translation
     nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
     bucket = pipeline.reconstructor.bucket(query, nearby)
+    if query.photograph is not None and query.photograph.read_depth is not None:
+        with context.stage("depth"):
+            query = query.with_depths()
     with context.stage("correspond"):
         correspondences = pipeline.matcher.correspond(
             query, references, check=context.check, query_matches=query_matches

@@ -3,19 +3,31 @@
 Where one reference is given the points are those of its depths; `Solver.LINES` needs no points at all.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from mapless.geometry import RigidTransform
+
 from .bundle.adjust import adjust_pose, with_covariance
 from .bundle.estimate import PosedSupport, Support, with_halves
+from .bundle.own_depth import checked, improved
 from .bundle.pose_problem import AdjustInput
 from .features.views import Matches, PosedView, Reconstruction
 from .judge.answer import Answer, Localization
 from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
 from .judge.hypothesis import Attempt, Doubt, Found, Solver, doubt_of, found_by
-from .judge.judge import contradiction, judge, one_reference_failure, trust_of_score
+from .judge.judge import (
+    MAX_DEPTH_RADIUS_SHARE,
+    contradiction,
+    judge,
+    one_reference_failure,
+    too_uncertain,
+    trust_of_own_depth,
+    trust_of_score,
+)
 from .judge.references import unmoved_failure
 from .judge.two_view import (
     lacks_distance,
@@ -27,11 +39,11 @@ from .judge.two_view import (
 )
 from .options import DoubtOptions, Variant
 from .pipeline import Coarse, structure_and_matches, unverified, wide_correspondences, with_wide_correspondences
-from .pose.one_reference import MatchedDepths, solve_one_reference
+from .pose.one_reference import MatchedDepths, solve_by_depths
 from .pose.pnp import gate_failure, solve_pose
 from .pose.two_view import TwoViewOptions, solve_two_view
 from .rejection import Rejection, RejectionReason
-from .structure.model import MetricScale, ScaleStage
+from .structure.model import MetricScale, ScaleSource, ScaleStage
 
 
 def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
@@ -44,6 +56,8 @@ def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
     """
     if attempt.solver is Solver.LINES:
         return found_by(attempt, _from_lines(coarse), doubt)
+    if attempt.solver is Solver.DEPTHS:
+        return found_by(attempt, _from_depths(coarse), doubt)
     made = with_wide_correspondences(coarse) if attempt.matching.is_wide else coarse
     answer, alone = _from_points(made), made.rejected_alone
     # If only the priors gave an initial pose, and no answer, the photograph lacks what it lacks without them.
@@ -74,9 +88,13 @@ def _from_points(coarse: Coarse) -> Answer:
     if isinstance(estimate, Rejection):
         return coarse.answer(estimate, support)
     posed = support.posed(estimate)
-    agreement = priors.log10_chance(estimate.world_from_camera)
-    failure, chance = _gated(posed, coarse, 0.0), 0.0
-    if failure and agreement:
+    if query.depths is not None:
+        posed = checked(posed)
+    # Depths that contradict the pose count always; what agrees only where the evidence does not suffice otherwise.
+    by_depth = posed.estimate.depth_log10_chance
+    agreement, chance = priors.log10_chance(estimate.world_from_camera) + by_depth, max(0.0, by_depth)
+    failure = _gated(posed, coarse, chance)
+    if failure and agreement != chance:
         failure, chance = _gated(posed, coarse, agreement), agreement
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), posed)
@@ -87,7 +105,8 @@ def _from_points(coarse: Coarse) -> Answer:
     with stage("uncertainty"):
         predicted = not prepared.structure_options.optimize
         estimate = with_covariance(posed, scale, options.adjust, priors, predicted)
-    return _judged(replace(posed, estimate=estimate), coarse, chance, agreement)
+    posed = replace(posed, estimate=estimate)
+    return _judged(posed if query.depths is None else improved(posed), coarse, chance, agreement)
 
 
 def _gated(support: PosedSupport, coarse: Coarse, log10_chance: float) -> str | None:
@@ -114,13 +133,26 @@ def _judged(support: PosedSupport, coarse: Coarse, chance: float, agreement: flo
 
 
 def _from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
-    """Estimates the pose from a single reference with depths; priors are compared with it, but not used."""
-    prepared, initial = coarse.prepared, scale.world_from_query
-    (reference,), (matches,) = prepared.references, prepared.correspondences.query_matches
-    origin, fixed = prepared.origin, prepared.pipeline.matcher.pairs.stationary
+    """Estimates the pose from a single reference with depths."""
+    (reference,), (matches,) = coarse.prepared.references, coarse.prepared.correspondences.query_matches
     depths = _depths_of_matches(coarse, scale, reference, matches)
+    return _by_depths(coarse, [depths], scale.world_from_query, scale.source)
+
+
+def _from_depths(coarse: Coarse) -> Answer:
+    """Estimates the pose from matches whose keypoints have depths in the photograph, or in references."""
+    pairs = zip(coarse.prepared.references, coarse.prepared.correspondences.query_matches, strict=True)
+    return _by_depths(coarse, [_stored_depths(*it) for it in pairs], None, ScaleSource.DEPTH)
+
+
+def _by_depths(
+    coarse: Coarse, depths: Sequence[MatchedDepths], initial: RigidTransform | None, source: ScaleSource
+) -> Answer:
+    """Estimates the pose from matches with depths; priors are compared with it, but not used."""
+    prepared, fixed = coarse.prepared, coarse.prepared.pipeline.matcher.pairs.stationary
+    given = prepared.query, prepared.references, prepared.correspondences.query_matches
     with prepared.context.stage("pnp"):
-        found = solve_one_reference(prepared.query, reference, matches, depths, initial, origin, fixed)
+        found = solve_by_depths(*given, depths, initial, prepared.origin, fixed)
     if isinstance(found, Rejection):
         return coarse.answer(found)
     estimate = found.support.estimate
@@ -128,23 +160,34 @@ def _from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
     estimate = replace(estimate, prior_checks=tuple(replace(it, used=False) for it in checks))
     support = replace(found.support, estimate=estimate)
     trust = trust_of_score(found.score)
+    if prepared.query.depths is not None:
+        support = improved(support)
+        estimate, trust = support.estimate, trust_of_own_depth(support, found.score)
+        if rejection := too_uncertain(support, MAX_DEPTH_RADIUS_SHARE):
+            return coarse.answer(rejection, support)
     failure = one_reference_failure(found, trust, prepared.options.coverage)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
-    return coarse.answer(replace(Localization.of(estimate, trust), scale_source=scale.source), support)
+    return coarse.answer(replace(Localization.of(estimate, trust), scale_source=source), support)
 
 
 def _depths_of_matches(coarse: Coarse, scale: MetricScale, reference: PosedView, matches: Matches) -> MatchedDepths:
     """Depths of the matched keypoints of a single reference: its own, or those that the coarse stage predicts."""
     if scale.stage is ScaleStage.DEPTH:
-        assert reference.depths is not None
-        known = np.isfinite(reference.depths.depth)
-        sigma = float(np.median(reference.depths.relative_sigma[known]))
-        return MatchedDepths(reference.depths.depth[matches[:, 1]].astype(np.float64), sigma, scale.relative_sigma)
+        return _stored_depths(reference, matches)
     assert isinstance(coarse.reconstruction, Reconstruction)
     (predicted,), view = coarse.reconstruction.references, reference.view
     depth = scale.metres_per_unit * predicted.depth_at(view.features.pixels(matches[:, 1]), view.camera)
     return MatchedDepths(depth, None, scale.relative_sigma)
+
+
+def _stored_depths(reference: PosedView, matches: Matches) -> MatchedDepths:
+    """Depths of the matched keypoints of a reference that are stored with it; NaN without any."""
+    if reference.depths is None or not np.isfinite(reference.depths.depth).any():
+        return MatchedDepths(np.full(len(matches), np.nan), None, 0.0)
+    depth, known = reference.depths.depth, np.isfinite(reference.depths.depth)
+    sigma = float(np.median(reference.depths.relative_sigma[known]))
+    return MatchedDepths(depth[matches[:, 1]].astype(np.float64), sigma, reference.depths.common_sigma)
 
 
 def _from_lines(coarse: Coarse) -> Answer:

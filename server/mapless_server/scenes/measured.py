@@ -44,6 +44,4 @@ def read_measured(store: Store, record: ReferenceRecord) -> MeasuredDepth:
         depth = decode_depth(image, (photo.width_px, photo.height_px), ANY_SIZE)
     except InvalidArgument as error:
         raise DataLoss(f"the depth of reference {record.reference_id!r} cannot be read: {error}") from error
-    height, width = depth.shape
-    camera = image.camera or photo.resized(width, height)
-    return MeasuredDepth(camera, depth, image.known_noise, image.camera_from_depth_camera)
+    return MeasuredDepth.of(image, depth, photo)

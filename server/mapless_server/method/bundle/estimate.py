@@ -35,6 +35,33 @@ class PoseStage(str, Enum):
     """The initial pose, because there was no time to refine it."""
 
 
+@dataclass(frozen=True)
+class DepthCheck:
+    """How the depth that was measured with a photograph compares with its matches at a pose.
+
+    Attributes:
+        keypoint_count: keypoints of the photograph that have a depth.
+        compared_count: inliers with a depth, on points whose own depth does not come from this photograph.
+        agreeing_count: those of them whose depths agree within the errors of sensor and points.
+        factor: the most probable factor by which the measured depths are longer than those of the pose; 0 for none.
+        factor_sigma: its standard deviation, as a share.
+        conflict: whether the depths contradict the pose, and were not used.
+        used: whether the depths contributed to the pose.
+    """
+
+    keypoint_count: int = 0
+    compared_count: int = 0
+    agreeing_count: int = 0
+    factor: float = 0.0
+    factor_sigma: float = 0.0
+    conflict: bool = False
+    used: bool = False
+
+
+NO_DEPTH = DepthCheck()
+"""Nothing was compared."""
+
+
 @dataclass(frozen=True, eq=False)
 class PoseEstimate:
     """A pose, before it is accepted or rejected.
@@ -52,6 +79,8 @@ class PoseEstimate:
         intrinsics: evidence of the matches with points about errors of the photograph's intrinsics, which the
             covariance of an adjusted pose contains; None without an adjustment.
         view: the photograph's view with the intrinsics of the estimate, if it contradicts the given ones; else None.
+        depth_check: how the photograph's depth compares with the pose; None without depth.
+        depth_log10_chance: log10 of the chance that a wrong pose agrees with it so; above 0 if it contradicts the pose.
     """
 
     world_from_camera: RigidTransform
@@ -64,6 +93,8 @@ class PoseEstimate:
     without_priors: PoseEstimate | None = None
     intrinsics: IntrinsicsEvidence | None = None
     view: View | None = None
+    depth_check: DepthCheck | None = None
+    depth_log10_chance: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

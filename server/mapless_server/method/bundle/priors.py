@@ -354,13 +354,18 @@ class Priors:
         if not self:
             return covariance
         _, information = self.gradient_and_information(world_from_camera)
-        # (S^-1 + J)^-1 = S (I + J S)^-1, which needs no inverse of S: some directions may be certain in it.
-        sharper = np.linalg.solve((np.eye(6) + information @ covariance).T, covariance.T).T
-        return np.asarray((sharper + sharper.T) / 2)
+        return sharpened(covariance, information)
 
 
 NO_PRIORS = Priors()
 """No prior at all."""
+
+
+def sharpened(covariance: Array, information: Array) -> Array:
+    """The covariance (N, N) with this information (N, N) added to what it knows."""
+    # (S^-1 + J)^-1 = S (I + J S)^-1, which needs no inverse of S: some directions may be certain in it.
+    sharper = np.linalg.solve((np.eye(len(covariance)) + information @ covariance).T, covariance.T).T
+    return np.asarray((sharper + sharper.T) / 2)
 
 
 def conflict_threshold(degrees_of_freedom: int) -> float:

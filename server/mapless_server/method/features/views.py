@@ -4,9 +4,10 @@ Images are reduced, and keypoints undistorted, here and nowhere else.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -109,6 +110,7 @@ class Photograph:
         read: function that returns the pixels, (H, W, 3) uint8 RGB, of the camera's size.
         read_ignored: function that returns the ignored pixels, of the same size; None if all are used.
         read_exif: function that returns the EXIF of the file.
+        read_depth: function that returns the depth measured with it, from its camera; None if there is none.
     """
 
     identify: Callable[[], str]
@@ -116,6 +118,7 @@ class Photograph:
     read: Callable[[], NDArray[np.uint8]]
     read_ignored: Callable[[], Ignored | None] = lambda: None
     read_exif: Callable[[], Exif] = lambda: NO_EXIF
+    read_depth: "Callable[[Camera], DepthMap] | None" = None
 
     @cached_property
     def sha256(self) -> str:
@@ -141,6 +144,8 @@ class View:
             references, where it is not needed.
         upright_deg: by how much the raster was turned clockwise to be upright by its EXIF before features were found;
             their pixels are of the raster that is not turned.
+        depths: depths that a sensor measured with a photograph to be localized, at its keypoints; None without. Those
+            of references are in PosedView.
     """
 
     camera: Camera
@@ -148,6 +153,13 @@ class View:
     photograph: Photograph | None = None
     distortion: Distortion | None = None
     upright_deg: float = 0.0
+    depths: "KeypointDepths | None" = None
+
+    def with_depths(self) -> "View":
+        """The view with the depths that a sensor measured with its photograph; itself without."""
+        if self.photograph is None or self.photograph.read_depth is None:
+            return self
+        return replace(self, depths=self.photograph.read_depth(self.photograph.camera).at_keypoints(self))
 
     def cells(self, columns: int) -> NDArray[np.int32]:
         """Indices (N,) of the keypoints' cells, row by row, in a grid of so many columns; see `grid_shape`.
@@ -188,10 +200,10 @@ class DepthSource(str, Enum):
 
 @dataclass(frozen=True, eq=False)
 class KeypointDepths:
-    """Depths at the keypoints of a reference, of any source.
+    """Depths at the keypoints of a photograph, of any source.
 
     Attributes:
-        depth: (N,) float32, in the unit of its pose, along the viewing direction; NaN where there is none.
+        depth: (N,) float32, in the unit of poses, along the viewing direction; NaN where there is none.
         relative_sigma: (N,) standard deviation of each depth, as a share of it, above 0.
         common_sigma: standard deviation of the factor that all share, as a share.
         source: where they come from.
@@ -201,6 +213,14 @@ class KeypointDepths:
     relative_sigma: NDArray[np.float32]
     common_sigma: float
     source: DepthSource = DepthSource.NETWORK
+
+
+class DepthMap(Protocol):
+    """Depths of a whole photograph."""
+
+    def at_keypoints(self, view: View) -> KeypointDepths:
+        """The depths at the keypoints of the photograph's view."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle.estimate import PoseEstimate, PoseStage, Support, TwoViewSupport
+from ..bundle.estimate import NO_DEPTH, DepthCheck, PoseEstimate, PoseStage, Support, TwoViewSupport
 from ..bundle.priors import PriorCheck
 from ..rejection import IntrinsicsCheck, Rejection
 from ..structure.model import MetricScale, ScaleSource
@@ -70,29 +70,6 @@ class Localization:
         )
 
 
-@dataclass(frozen=True)
-class DepthCheck:
-    """How the depth that was measured with a photograph compares with its matches at a pose.
-
-    Attributes:
-        keypoint_count: keypoints of the photograph that have a depth.
-        compared_count: inliers with a depth, on points whose own depth does not come from this photograph.
-        agreeing_count: those of them whose depths agree within the errors of sensor and points.
-        factor: the most probable factor by which the measured depths are longer than those of the pose; 0 for none.
-        factor_sigma: its standard deviation, as a share.
-        conflict: whether the depths contradict the pose, and were not used.
-        used: whether the depths contributed to the pose.
-    """
-
-    keypoint_count: int = 0
-    compared_count: int = 0
-    agreeing_count: int = 0
-    factor: float = 0.0
-    factor_sigma: float = 0.0
-    conflict: bool = False
-    used: bool = False
-
-
 @dataclass(frozen=True, eq=False)
 class Answer:
     """The answer to one query.
@@ -115,7 +92,7 @@ class Answer:
     reference_inlier_counts: tuple[int, ...] = ()
     support: Support | None = None
     stationary_count: int = 0
-    depth_check: DepthCheck = DepthCheck()
+    depth_check: DepthCheck = NO_DEPTH
 
     @property
     def is_finite(self) -> bool:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless_server.bounds import check_bounds
 
-from ..bundle.estimate import Support, accuracy_from_covariance
+from ..bundle.estimate import PosedSupport, Support, accuracy_from_covariance
 from ..bundle.priors import Priors
 from ..pose import relative
 from ..pose.pnp import disc_chance
@@ -28,7 +28,7 @@ from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .answer import Localization
 from .evidence import Votes, votes_of
-from .hypothesis import Doubt, Failed, Found, Hypothesis, Raster
+from .hypothesis import Doubt, Failed, Found, Hypothesis, Raster, Solver
 
 
 @dataclass(frozen=True)
@@ -191,13 +191,22 @@ def _conflicts(place: _Place, priors: Priors) -> bool:
 
 
 def _scores(hypotheses: Sequence[Hypothesis], found: Sequence[Found]) -> list[float]:
-    """The scores of the poses on the same matches; their numbers of inliers, if no matches are known."""
+    """The scores of the poses on the same matches, and on the depth of the photograph, as log10 of chances.
+
+    Their numbers of inliers, if no matches are known.
+    """
     if len(hypotheses) == 1:
         return [0.0]
     matches = list(_matches(found))
     if not matches:
         return [float(it.inlier_count) for it in hypotheses]
-    return [sum(it.score(pose.world_from_camera) for it in matches) for pose in hypotheses]
+    return [sum(it.score(pose.world_from_camera) for it in matches) - _by_depth(pose) for pose in hypotheses]
+
+
+def _by_depth(pose: Hypothesis) -> float:
+    """log10 of the chance that the photograph's depth agrees so with a pose; 0 without."""
+    support = pose.answer.support
+    return support.estimate.depth_log10_chance if isinstance(support, PosedSupport) else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,11 +268,12 @@ def _rejected(found: Sequence[Found], within: Sequence[Hypothesis], priors: Prio
     After those with a cause comes that of a pose that only its radius speaks against.
     """
 
-    def says(result: Found) -> tuple[bool, int, bool]:
+    def says(result: Found) -> tuple[bool, int, bool, bool]:
         outcome = result.answer.outcome
         assert isinstance(outcome, Rejection)
         names_two = bool(outcome.hypotheses) or Doubt.CAMERA in result.doubts
-        return names_two, result.attempt.features, outcome.hint is not None
+        by_depth = result.attempt.solver is Solver.DEPTHS and isinstance(result, Hypothesis)
+        return names_two, result.attempt.features, outcome.hint is not None, by_depth
 
     chosen, imprecise = max(found, key=says), _imprecise(within, found, priors, options)
     if imprecise is not None and not says(chosen)[0]:

@@ -46,6 +46,8 @@ class Solver(Enum):
     """2D-3D matches; with one reference, those with the depths of a network."""
     LINES = "lines"
     """Matches with single references and 2D-3D matches together, see `pose.two_view`."""
+    DEPTHS = "depths"
+    """Matches with depths in the photograph or in references, see `pose.one_reference`."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The pose from a single reference, with depths that a sensor measured or a network predicts.
+"""The pose from matches with depths, which a sensor measured or a network predicts: one reference is enough.
 
 The matches with one reference determine the rotation and the direction of the step from one camera to the other; the
 length of the step follows from the depths. Both are one problem of six unknowns: each match is a point at its depth,
@@ -11,8 +11,13 @@ at least as stated, and as stated where the step is too small to show them. An e
 sensor's or the network's metre, changes no residual: it moves the camera along the step, and the covariance of the pose
 contains it as s^2 d d^T, with d the step and s its relative standard deviation. Neither do errors of the reference's
 pose, whose usual size the covariance contains.
+
+A match whose reference has no depth is a point of the photograph's own depth, in the photograph's frame, that the
+reference sees: the same problem turned around. The factor that these depths share is an unknown with its prior, since
+several references, or depths of both sides, show it. It makes the scene's unit no other one: that is of the poses.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,12 +30,20 @@ from ..bundle.estimate import PosedSupport, PoseEstimate, PoseStage
 from ..bundle.pose_problem import DRIFT_INFLATION, OWN_INFLATION, USUAL_DRIFT, USUAL_OWN
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, View
-from ..optim.optimize import cauchy_weight, motion_jacobian, perturbed, solve_step, world_covariance
+from ..optim.optimize import (
+    cauchy_weight,
+    motion_jacobian,
+    perturbed,
+    solve_step,
+    world_covariance,
+    world_jacobian,
+)
 from ..pairs.stationary import StationaryOptions, are_moved
 from ..rejection import Rejection, RejectionReason
-from ..structure.model import PixelPoints, PointMatches, Structure
+from ..structure.model import DepthPlanes, PixelPoints, PointMatches, Structure
 from ..structure.observations import FIRST_GUESS
-from .pnp import PnpOptions, false_alarms, ransac
+from .pnp import MIN_MATCHES, PnpOptions, false_alarms, ransac
+from .turned import Rows, TurnedMatches
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -88,96 +101,160 @@ class Found:
     moved_score: float
 
 
-def solve_one_reference(
+def solve_by_depths(
     query: View,
-    reference: PosedView,
-    matches: Matches,
-    depths: MatchedDepths,
+    references: Sequence[PosedView],
+    query_matches: Sequence[Matches],
+    depths: Sequence[MatchedDepths],
     initial: RigidTransform | None,
     origin: Array,
     stationary: StationaryOptions,
 ) -> Found | Rejection:
-    """Estimates the pose of a query from its matches (M, 2) with a single reference.
+    """Estimates the pose of a query from its matches (M, 2) with references, one or more, of which a side has a depth.
 
-    TOO_FEW_MATCHES or PNP_FAILED if there is none. `initial` is a pose to begin with; `origin` (3,) is that of the
-    reference's world in the caller's world; `stationary` says what is at the same pixels.
+    TOO_FEW_MATCHES or PNP_FAILED if there is none. `depths` are those of the references' keypoints that the matches
+    have; the query's own, if any, make the points of the other matches. `initial` is a pose to begin with; `origin`
+    (3,) is that of the references' world in the caller's world; `stationary` says what is at the same pixels.
     """
-    points = _points(reference, depths.depth, matches)
-    known = np.isfinite(points).all(axis=1)
-    matches, points = matches[known], points[known]
+    problem, view, matches = _problem_of(query, references, query_matches, depths)
     if len(matches) < MIN_INLIERS:
         message = f"{len(matches)} matches with a depth, {MIN_INLIERS} needed with one reference"
         return Rejection(RejectionReason.TOO_FEW_MATCHES, message)
-    seen = PixelPoints(query.camera, points, query.features.pixels(matches[:, 0]))
-    problem = _Problem(seen, reference.world_from_camera.translation, depths.sigma)
     solved = _solve(problem, initial)
     count = 0 if solved is None else int(solved.inliers.sum())
     if solved is None or count < MIN_INLIERS:
         message = f"no pose explains more than {count} of {len(matches)} matches, {MIN_INLIERS} needed"
         return Rejection(RejectionReason.PNP_FAILED, message)
     pose = solved.world_from_camera
+    nearest = int(np.bincount(view[solved.inliers], minlength=len(references)).argmax())
+    centre = references[nearest].world_from_camera.translation
     covariance = _covariance(problem, solved)
-    covariance += _reference_covariance(problem, solved)
-    covariance += scale_covariance(pose, reference.world_from_camera.translation, depths.common_sigma)
+    covariance += _reference_covariance(problem, solved, centre)
+    if problem.turned is None or len(problem.turned) < len(view):
+        covariance += scale_covariance(pose, centre, depths[nearest].common_sigma)
     estimate = PoseEstimate(pose, PoseStage.REFINED, solved.inliers, solved.errors_px, covariance)
-    rows = np.arange(len(points))
+    rows = np.arange(len(matches))
     structure = Structure(
-        points,
-        Tracks(rows, np.zeros_like(rows), matches[:, 1].astype(np.intp)),
+        problem.points(solved),
+        Tracks(rows, view, matches[:, 1].astype(np.intp)),
         replace(FIRST_GUESS, level_px=solved.sigma_px),
+        None if query.depths is None else _planes(problem, solved, references, view, depths),
     )
     found = PointMatches(rows, matches[:, 0].astype(np.intp), np.zeros(len(rows), bool), 0.0)
-    support = PosedSupport(query, (reference,), structure, found, origin, (matches,), estimate=estimate)
-    moved = are_moved(query, reference, matches, matches, stationary)
+    used = tuple(matches[view == i] for i in range(len(references)))
+    support = PosedSupport(query, tuple(references), structure, found, origin, used, estimate=estimate)
+    moved = np.ones(len(matches), bool)
+    for i, (reference, its) in enumerate(zip(references, used, strict=True)):
+        moved[view == i] = are_moved(query, reference, its, its, stationary)
     some = replace(solved, inliers=solved.inliers[moved], errors_px=solved.errors_px[moved])
-    moved_score = score_of(replace(problem, seen=problem.seen[moved]), some)
-    return Found(support, score_of(problem, solved), moved_score)
+    return Found(support, score_of(problem, solved), score_of(problem[moved], some))
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Points at their depths that the query sees, the reference's centre (3,), and the stated error of a depth."""
+    """Matches with a depth: points at the references' depths, and last those at the query's.
+
+    Attributes:
+        seen: points at depths of the references that the query sees.
+        reference_centre: (S, 3) centre of the reference of each.
+        depth_sigma: the stated error of a depth, as a share; None if it is not stated.
+        turned: points at depths of the query; None if there are none.
+    """
 
     seen: PixelPoints
     reference_centre: Array
     depth_sigma: float | None
+    turned: TurnedMatches | None = None
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> "_Problem":
+        count = len(self.seen)
+        turned = None if self.turned is None else self.turned[rows[count:]]
+        seen, centre = self.seen[rows[:count]], self.reference_centre[rows[:count]]
+        return replace(self, seen=seen, reference_centre=centre, turned=turned)
+
+    def points(self, solved: "_Solved") -> Array:
+        """The points (M, 3) in the world."""
+        if self.turned is None:
+            return self.seen.x_in_world
+        own = self.turned.in_world(solved.world_from_camera, solved.log_factor)
+        return np.concatenate([self.seen.x_in_world, own])
 
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """A pose with its inliers (M,), their whitened errors (M,), pixels, and the errors of keypoints and depths."""
+    """A pose with its inliers (M,), their whitened errors (M,), pixels, and the errors of keypoints and depths.
+
+    `log_factor` is what the query's depths are multiplied by.
+    """
 
     world_from_camera: RigidTransform
     inliers: NDArray[np.bool_]
     errors_px: Array
     sigma_px: float
     depth_sigma: float
+    log_factor: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Residuals (M, 2), and their derivatives (M, 2, 6) by a left perturbation and (M, 2) by log depths."""
+def _problem_of(
+    query: View,
+    references: Sequence[PosedView],
+    query_matches: Sequence[Matches],
+    depths: Sequence[MatchedDepths],
+) -> tuple[_Problem, NDArray[np.intp], Matches]:
+    """The problem of the matches with a depth, with the index (M,) of each one's reference, and the matches (M, 2)."""
+    view = np.repeat(np.arange(len(references)), [len(it) for it in query_matches])
+    matches = np.concatenate(query_matches)
+    points = np.concatenate([_points(*it) for it in zip(references, depths, query_matches, strict=True)])
+    known = np.isfinite(points).all(axis=1)
+    stated = [it.sigma for it in depths if it.sigma is not None]
+    sigma = float(np.median(stated)) if len(stated) > 1 else next(iter(stated), None)
+    centres = np.array([it.world_from_camera.translation for it in references])
+    seen = PixelPoints(query.camera, points[known], query.features.pixels(matches[known, 0]))
+    problem = _Problem(seen, centres[view[known]], sigma)
+    if query.depths is None:
+        return problem, view[known], matches[known]
+    own = ~known & np.isfinite(query.depths.depth[matches[:, 0]])
+    if not own.any():
+        return problem, view[known], matches[known]
+    problem = replace(problem, turned=TurnedMatches.of(query, query.depths, references, view[own], matches[own]))
+    if problem.turned is not None and problem.depth_sigma is None:
+        problem = replace(problem, depth_sigma=problem.turned.depth_sigma)
+    return problem, np.concatenate([view[known], view[own]]), np.concatenate([matches[known], matches[own]])
 
-    residual: Array
-    by_pose: Array
-    by_depth: Array
-    in_front: NDArray[np.bool_]
 
-    def information(self, sigma_px: float, depth_sigma: float) -> Array:
-        """Inverse covariances (M, 2, 2) of the residuals, in closed form: points beside the camera make them huge."""
-        j = depth_sigma * self.by_depth
-        share = j[:, :, None] * j[:, None, :] / (sigma_px**2 + np.square(j).sum(axis=1))[:, None, None]
-        return np.asarray((np.eye(2) - share) / sigma_px**2)
-
-
-def _points(reference: PosedView, depth: Array, matches: Matches) -> Array:
+def _points(reference: PosedView, depths: MatchedDepths, matches: Matches) -> Array:
     """Points (M, 3) in the world at the depths (M,) of the reference's keypoints; NaN without a depth."""
-    rays = reference.view.camera.rays(reference.view.features.pixels(matches[:, 1]))
+    rays, depth = reference.view.camera.rays(reference.view.features.pixels(matches[:, 1])), depths.depth
     points = rays / rays[:, 2:] * np.where(depth > 0, depth, np.nan)[:, None]
     return np.asarray(reference.world_from_camera.apply(points))
 
 
-def _linearize(problem: _Problem, world_from_camera: RigidTransform) -> _Rows:
+def _planes(
+    problem: _Problem,
+    solved: _Solved,
+    references: Sequence[PosedView],
+    view: NDArray[np.intp],
+    depths: Sequence[MatchedDepths],
+) -> DepthPlanes:
+    """Planes of the points at the references' depths; those at the query's are near none."""
+    count = len(problem.seen)
+    normal = np.array([it.world_from_camera.rotation[:, 2] for it in references])[view[:count]]
+    depth = (normal * (problem.seen.x_in_world - problem.reference_centre)).sum(axis=1)
+    offset = depth + (normal * problem.reference_centre).sum(axis=1)
+    common = np.array([it.common_sigma for it in depths])[view[:count]] * depth
+    planes = DepthPlanes(normal, offset, (solved.depth_sigma * depth) ** -2.0, view[:count], common)
+    return planes.and_last(DepthPlanes.unknown(len(view) - count))
+
+
+def _linearize(problem: _Problem, world_from_camera: RigidTransform, log_factor: float = 0.0) -> Rows:
+    """The residuals of all matches at a pose."""
+    rows, turned = _linearize_seen(problem, world_from_camera), problem.turned
+    if turned is None:
+        return rows
+    return rows.and_last(turned.linearize(world_from_camera, log_factor))
+
+
+def _linearize_seen(problem: _Problem, world_from_camera: RigidTransform) -> Rows:
     camera, camera_from_world = problem.seen.camera, world_from_camera.inverse()
     focal = np.array([camera.focal_x_px, camera.focal_y_px])
     x = camera_from_world.apply(problem.seen.x_in_world)
@@ -187,10 +264,10 @@ def _linearize(problem: _Problem, world_from_camera: RigidTransform) -> _Rows:
     residual = np.where(in_front[:, None], camera.project(x) - problem.seen.pixels, 1e6)
     along = (problem.seen.x_in_world - problem.reference_centre) @ camera_from_world.rotation.T
     by_depth = np.einsum("mij,mj->mi", projection, along)
-    return _Rows(residual, projection @ motion_jacobian(x), np.where(in_front[:, None], by_depth, 0.0), in_front)
+    return Rows(residual, projection @ motion_jacobian(x), np.where(in_front[:, None], by_depth, 0.0), in_front)
 
 
-def _distances(rows: _Rows, sigma_px: float, depth_sigma: float) -> Array:
+def _distances(rows: Rows, sigma_px: float, depth_sigma: float) -> Array:
     """Lengths (M,) of the residuals, in standard deviations."""
     information = rows.information(sigma_px, depth_sigma)
     squared = np.einsum("mi,mij,mj->m", rows.residual, information, rows.residual)
@@ -204,7 +281,11 @@ def _solve(problem: _Problem, initial: RigidTransform | None) -> _Solved | None:
         distance = _distances(_linearize(problem, pose), FIRST_SIGMA_PX, FIRST_DEPTH_SIGMA)
         return int((distance < INLIER_SIGMA).sum())
 
-    found = [ransac(problem.seen, initial, PnpOptions(inlier_px=inlier_px)) for inlier_px in (4.0, 16.0)]
+    found, options = list[RigidTransform | None](), [PnpOptions(inlier_px=inlier_px) for inlier_px in (4.0, 16.0)]
+    if len(problem.seen) >= MIN_MATCHES:
+        found += [ransac(problem.seen, initial, it) for it in options]
+    if problem.turned is not None and len(problem.turned) >= MIN_MATCHES:
+        found += [problem.turned.ransac(it) for it in options]
     candidates = [pose for pose in (initial, *found) if pose]
     return _refine(problem, max(candidates, key=inlier_count)) if candidates else None
 
@@ -214,25 +295,29 @@ def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
 
     Not by `minimize`: the errors, and with them the cost, change after each step.
     """
-    sigma_px, depth_sigma = FIRST_SIGMA_PX, FIRST_DEPTH_SIGMA
+    sigma_px, depth_sigma, log_factor = FIRST_SIGMA_PX, FIRST_DEPTH_SIGMA, 0.0
     for iteration in range(ITERATIONS):
-        rows = _linearize(problem, pose)
+        rows = _linearize(problem, pose, log_factor)
         distance = _distances(rows, sigma_px, depth_sigma)
         information = rows.information(sigma_px, depth_sigma) * cauchy_weight(distance**2, 2.0)[:, None, None]
         hessian = np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose)
         gradient = np.einsum("mia,mij,mj->a", rows.by_pose, information, rows.residual)
+        if problem.turned is not None:
+            hessian[6, 6] += problem.turned.common_sigma**-2
+            gradient[6] += log_factor * problem.turned.common_sigma**-2
         step = solve_step(hessian, gradient, least_norm=True)
         if step is None:
             break
-        pose = perturbed(pose.inverse(), step).inverse()
+        pose = perturbed(pose.inverse(), step[:6]).inverse()
+        log_factor += float(step[6]) if problem.turned is not None else 0.0
         inliers = distance < INLIER_SIGMA
         if iteration >= 2 and inliers.sum() >= MIN_INLIERS:
-            sigma_px, depth_sigma = _noise(_linearize(problem, pose), inliers, problem.depth_sigma)
-    distance = _distances(_linearize(problem, pose), sigma_px, depth_sigma)
-    return _Solved(pose, distance < INLIER_SIGMA, distance * sigma_px, sigma_px, depth_sigma)
+            sigma_px, depth_sigma = _noise(_linearize(problem, pose, log_factor), inliers, problem.depth_sigma)
+    distance = _distances(_linearize(problem, pose, log_factor), sigma_px, depth_sigma)
+    return _Solved(pose, distance < INLIER_SIGMA, distance * sigma_px, sigma_px, depth_sigma, log_factor)
 
 
-def _noise(rows: _Rows, inliers: NDArray[np.bool_], stated_sigma: float | None) -> tuple[float, float]:
+def _noise(rows: Rows, inliers: NDArray[np.bool_], stated_sigma: float | None) -> tuple[float, float]:
     """Standard deviations of keypoints across the epipolar lines, and of depths along them, at least as stated."""
     least = max(stated_sigma or 0.0, MIN_DEPTH_SIGMA)
     residual, by_depth = rows.residual[inliers], rows.by_depth[inliers]
@@ -252,26 +337,33 @@ def _noise(rows: _Rows, inliers: NDArray[np.bool_], stated_sigma: float | None) 
 
 
 def _covariance(problem: _Problem, solved: _Solved) -> Array:
-    """Covariance (6, 6) in the world, without the part of the scale."""
-    rows = _linearize(problem, solved.world_from_camera)
+    """Covariance (6, 6) in the world, with the part of the factor of the query's depths, without other scales."""
+    pose, shared = solved.world_from_camera, 1 + solved.inliers.sum() / SHARED_MATCHES
+    rows = _linearize(problem, pose, solved.log_factor)
     information = rows.information(solved.sigma_px, solved.depth_sigma) * solved.inliers[:, None, None]
     hessian = np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose)
-    covariance = world_covariance(hessian, solved.world_from_camera)
-    covariance *= 1 + solved.inliers.sum() / SHARED_MATCHES
+    covariance = world_covariance(hessian[:6, :6], pose)
+    covariance *= shared
     factor = np.repeat([1.0, ROTATION_FACTOR], 3)
-    return np.asarray(factor[:, None] * covariance * factor)
+    covariance = np.asarray(factor[:, None] * covariance * factor)
+    if problem.turned is None:
+        return covariance
+    motion = -np.linalg.pinv(hessian[:6, :6], hermitian=True) @ hessian[:6, 6]
+    of_factor = max(0.0, float(hessian[6, 6] + hessian[6, :6] @ motion)) / shared
+    moved = world_jacobian(pose) @ motion
+    return np.asarray(covariance + np.outer(moved, moved) / (of_factor + problem.turned.common_sigma**-2))
 
 
-def _reference_covariance(problem: _Problem, solved: _Solved) -> Array:
+def _reference_covariance(problem: _Problem, solved: _Solved, reference_centre: Array) -> Array:
     """Covariance (6, 6) in the world by the errors of the reference's pose, with the sizes that are usual.
 
     Its own, and what its poses drift over the step (see `bundle.pose_problem`); the query's pose moves with it.
     """
     camera, pose = problem.seen.camera, solved.world_from_camera
-    depth_m = float(np.median(pose.inverse().apply(problem.seen.x_in_world[solved.inliers])[:, 2]))
+    depth_m = float(np.median(pose.inverse().apply(problem.points(solved)[solved.inliers])[:, 2]))
     angle = solved.sigma_px / camera.focal_x_px * np.hypot(OWN_INFLATION * USUAL_OWN, DRIFT_INFLATION * USUAL_DRIFT)
     moved = np.eye(6)
-    moved[:3, 3:] = cross_matrix(problem.reference_centre - pose.translation)
+    moved[:3, 3:] = cross_matrix(reference_centre - pose.translation)
     return np.asarray(moved * np.repeat([angle * depth_m, angle], 3) ** 2 @ moved.T)
 
 
@@ -283,7 +375,7 @@ def score_of(problem: _Problem, solved: _Solved) -> float:
     if not solved.inliers.any():
         return -np.inf
     # Areas of the residuals' ellipses of one standard deviation, square pixels.
-    by_depth = solved.depth_sigma * _linearize(problem, solved.world_from_camera).by_depth
+    by_depth = solved.depth_sigma * _linearize(problem, solved.world_from_camera, solved.log_factor).by_depth
     along_px = np.sqrt(solved.sigma_px**2 + np.square(by_depth).sum(axis=1))
     areas = INLIER_SIGMA**2 * (np.pi * solved.sigma_px * along_px)
     image = problem.seen.camera.width_px * problem.seen.camera.height_px

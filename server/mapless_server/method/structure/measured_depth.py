@@ -21,7 +21,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from mapless.depth import DepthNoise
+from mapless.depth import DepthImage, DepthNoise
 from mapless.geometry import Array, Camera, RigidTransform
 
 from ..features.views import DepthSource, KeypointDepths, View, undistort_pixels
@@ -42,6 +42,13 @@ class MeasuredDepth:
     depth: NDArray[np.float32]
     noise: DepthNoise
     camera_from_depth_camera: RigidTransform | None = None
+
+    @staticmethod
+    def of(image: DepthImage, depth: NDArray[np.float32], photo: Camera) -> "MeasuredDepth":
+        """The decoded depths (H, W) of an image, measured with a photograph of this camera."""
+        height, width = depth.shape
+        camera = image.camera or photo.resized(width, height)
+        return MeasuredDepth(camera, depth, image.known_noise, image.camera_from_depth_camera)
 
     def at_keypoints(self, view: View) -> KeypointDepths:
         """The depths at the keypoints of the photograph, with their standard deviations."""

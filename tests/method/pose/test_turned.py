@@ -1,0 +1,144 @@
+"""Poses from the depth of the photograph: planted points, references without depth, and depths with known errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from support.scenes import random_for
+
+from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
+from mapless_server.method.bundle.estimate import accuracy_from_covariance
+from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, Matches, PosedView, View
+from mapless_server.method.pairs.stationary import StationaryOptions
+from mapless_server.method.pose.one_reference import Found, MatchedDepths, solve_by_depths
+from mapless_server.method.rejection import Rejection
+
+CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
+NEARLY = 1e-6
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of a planted sensor: factor of all depths, each depth as a share; keypoints; share of wrong matches."""
+
+    factor: float = 1.0
+    common_sigma: float = 0.02
+    depth: float = 0.01
+    keypoint_px: float = 0.5
+    wrong_share: float = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """A photograph with depth, references without, their matches and the true pose."""
+
+    query: View
+    references: tuple[PosedView, ...]
+    matches: tuple[Matches, ...]
+    world_from_query: RigidTransform
+
+    def solved(self) -> Found | Rejection:
+        unknown = [MatchedDepths(np.full(len(it), np.nan), None, 0.0) for it in self.matches]
+        given = self.query, self.references, self.matches, unknown
+        return solve_by_depths(*given, None, np.zeros(3), StationaryOptions())
+
+    def off_m(self, found: Found) -> float:
+        pose = found.support.estimate.world_from_camera
+        return float(np.linalg.norm(pose.translation - self.world_from_query.translation))
+
+
+def view_at(pixels: Array, depths: KeypointDepths | None = None) -> View:
+    keypoints = pixels.astype(np.float32)
+    features = Features(keypoints, np.zeros((len(pixels), 4), np.float32), np.full(len(pixels), 4, np.float32))
+    return View(CAMERA, features, depths=depths)
+
+
+def planted(random: np.random.Generator, errors: Errors, count: int = 1, points: int = 150) -> Planted:
+    """Points two to six metres before the photograph, and references half a metre to a metre aside."""
+    pixels = random.uniform(10, [310, 230], (4 * points, 2))
+    rays = CAMERA.rays(pixels)
+    x = rays / rays[:, 2:] * random.uniform(2, 6, (len(pixels), 1))
+    steps = random.normal(size=(count, 3)) * [1, 0.5, 0.5]
+    steps *= random.uniform(0.5, 1.0, (count, 1)) / np.linalg.norm(steps, axis=1, keepdims=True)
+    from_references = [RigidTransform(rotation_from_vector(random.normal(0, 0.1, 3)), it) for it in steps]
+    seen = [CAMERA.project(it.inverse().apply(x)) for it in from_references]
+    inside = np.all([((it > 0) & (it < [319, 239])).all(axis=1) for it in seen], axis=0)
+    both = np.flatnonzero(inside)[:points]
+    depth = x[both, 2] * errors.factor * np.exp(errors.depth * random.normal(size=len(both)))
+    sigma = np.full(len(both), np.hypot(errors.depth, NEARLY), np.float32)
+    depths = KeypointDepths(depth.astype(np.float32), sigma, errors.common_sigma, DepthSource.MEASURED)
+    noise = [random.normal(0, errors.keypoint_px, (len(both), 2)) for _ in range(count + 1)]
+    world_from_query = RigidTransform(rotation_from_vector(random.normal(0, 1, 3)), random.normal(0, 5, 3))
+    references, matches = [], []
+    for i, (pose, its) in enumerate(zip(from_references, seen, strict=True)):
+        view = view_at(its[both] + noise[i + 1])
+        references.append(PosedView(f"k{i}", f"r{i}", view, world_from_query.compose(pose)))
+        pairs = np.repeat(np.arange(len(both), dtype=np.int32)[:, None], 2, axis=1)
+        wrong = random.permutation(len(both))[: round(errors.wrong_share * len(both))]
+        pairs[wrong, 1] = np.roll(pairs[wrong, 1], 1)
+        matches.append(pairs)
+    query = view_at(pixels[both] + noise[0], depths)
+    return Planted(query, tuple(references), tuple(matches), world_from_query)
+
+
+def found(given: Planted) -> Found:
+    result = given.solved()
+    assert isinstance(result, Found), result
+    return result
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_photographs_depth_is_enough(count: int) -> None:
+    for seed in range(4):
+        given = planted(random_for(seed), Errors(keypoint_px=0.0, depth=NEARLY, common_sigma=0.0), count)
+        assert given.off_m(found(given)) < 1e-3
+
+
+def test_exchanged_with_its_reference_it_has_the_inverse_pose() -> None:
+    given = planted(random_for(3), Errors())
+    (reference,), (matches,), depths = given.references, given.matches, given.query.depths
+    assert depths is not None
+    there = RigidTransform.identity()
+    with_depth = PosedView("q", "q", replace(given.query, depths=None), there)
+    its_depths = MatchedDepths(depths.depth[matches[:, 0]].astype(np.float64), 0.01, depths.common_sigma)
+    turned = solve_by_depths(
+        reference.view, [with_depth], [matches[:, ::-1]], [its_depths], None, np.zeros(3), StationaryOptions()
+    )
+    assert isinstance(turned, Found)
+    query_from_reference = turned.support.estimate.world_from_camera
+    pose = reference.world_from_camera.compose(query_from_reference.inverse())
+    same = found(given).support.estimate.world_from_camera
+    assert np.allclose(pose.matrix(), same.matrix(), atol=2e-3)
+
+
+def test_several_references_correct_the_factor() -> None:
+    errors = Errors(factor=1.05, common_sigma=0.05)
+    off = {count: np.median([_off(errors, seed, count) for seed in range(6)]) for count in (1, 4)}
+    assert off[1] > 0.02
+    assert off[4] < 0.01
+
+
+def _off(errors: Errors, seed: int, count: int) -> float:
+    given = planted(random_for(seed), errors, count)
+    return given.off_m(found(given))
+
+
+def test_radii_contain_the_factors_error() -> None:
+    inside = []
+    for seed in range(40):
+        random = random_for(seed)
+        given = planted(random, Errors(factor=float(np.exp(0.03 * random.normal())), common_sigma=0.03))
+        result = found(given)
+        radii = accuracy_from_covariance(result.support.estimate.covariance)
+        off_m = given.off_m(result)
+        inside.append((off_m <= radii.position_68_m, off_m <= radii.position_95_m))
+    in_68, in_95 = np.mean(inside, axis=0)
+    assert 0.55 <= in_68 <= 0.9
+    assert in_95 >= 0.9
+
+
+def test_wrong_matches_give_no_accepted_pose() -> None:
+    result = planted(random_for(1), Errors(wrong_share=1.0)).solved()
+    assert isinstance(result, Rejection) or result.score < 3
