@@ -12,7 +12,6 @@ from mapless.geometry import RigidTransform
 
 from .bundle.adjust import adjust_pose, with_covariance
 from .bundle.estimate import PosedSupport, Support, with_halves
-from .bundle.own_depth import checked, improved
 from .bundle.pose_problem import AdjustInput
 from .features.views import Matches, PosedView, Reconstruction
 from .judge.answer import Answer, Localization
@@ -20,7 +19,7 @@ from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
 from .judge.hypothesis import Attempt, Doubt, Found, Solver, doubt_of, found_by
 from .judge.judge import (
-    MAX_DEPTH_RADIUS_SHARE,
+    MAX_GUESSED_RADIUS_SHARE,
     contradiction,
     judge,
     one_reference_failure,
@@ -40,6 +39,7 @@ from .judge.two_view import (
 from .options import DoubtOptions, Variant
 from .pipeline import Coarse, structure_and_matches, unverified, wide_correspondences, with_wide_correspondences
 from .pose.one_reference import MatchedDepths, solve_by_depths
+from .pose.own_depth import checked, improved
 from .pose.pnp import gate_failure, solve_pose
 from .pose.two_view import TwoViewOptions, solve_two_view
 from .rejection import Rejection, RejectionReason
@@ -163,7 +163,7 @@ def _by_depths(
     if prepared.query.depths is not None:
         support = improved(support)
         estimate, trust = support.estimate, trust_of_own_depth(support, found.score)
-        if rejection := too_uncertain(support, MAX_DEPTH_RADIUS_SHARE):
+        if rejection := too_uncertain(support, MAX_GUESSED_RADIUS_SHARE):
             return coarse.answer(rejection, support)
     failure = one_reference_failure(found, trust, prepared.options.coverage)
     if failure:

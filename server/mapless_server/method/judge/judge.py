@@ -64,8 +64,8 @@ MAX_RADIUS_SHARE = 0.08
 larger one too many are wrong. Evidence: largest-radius."""
 
 MAX_GUESSED_RADIUS_SHARE = 0.04
-"""The same where the intrinsics are a guess: most of the radius is then an error of the distance that no other evidence
-shows. Evidence: unknown-camera."""
+"""The same where the intrinsics are a guess, or where depths give the pose and some are the photograph's: most of the
+radius is then an error of the distance that no other evidence shows. Evidence: unknown-camera."""
 
 LEVELS = (
     0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0,
@@ -87,10 +87,6 @@ OWN_DEPTH_SCORES = (
 )  # fmt: skip
 """The same where the photograph has depth: of 773 answers to pairs of photographs of four places, by three kinds of
 sensors, each of which counts alike; half of the references have depth, too (`research.depth_scores`)."""
-
-MAX_DEPTH_RADIUS_SHARE = 0.045
-"""`MAX_RADIUS_SHARE` of poses by such scores: of 444 poses with a smaller one 3 were wrong, of 28 with a larger one 12
-(`research.depth_scores`)."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ from ..rejection import Rejection, RejectionReason
 from ..structure.model import DepthPlanes, PixelPoints, PointMatches, Structure
 from ..structure.observations import FIRST_GUESS
 from .pnp import MIN_MATCHES, PnpOptions, false_alarms, ransac
-from .turned import Rows, TurnedMatches
+from .turned import BEHIND_PX, Rows, TurnedMatches
 
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -261,7 +261,7 @@ def _linearize_seen(problem: _Problem, world_from_camera: RigidTransform) -> Row
     in_front = x[:, 2] > 1e-6
     x = np.where(in_front[:, None], x, [0.0, 0.0, 1.0])
     projection = normalize_jacobian(x) * focal[:, None]
-    residual = np.where(in_front[:, None], camera.project(x) - problem.seen.pixels, 1e6)
+    residual = np.where(in_front[:, None], camera.project(x) - problem.seen.pixels, BEHIND_PX)
     along = (problem.seen.x_in_world - problem.reference_centre) @ camera_from_world.rotation.T
     by_depth = np.einsum("mij,mj->mi", projection, along)
     return Rows(residual, projection @ motion_jacobian(x), np.where(in_front[:, None], by_depth, 0.0), in_front)

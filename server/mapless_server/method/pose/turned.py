@@ -20,8 +20,8 @@ from ..structure.model import PixelPoints
 from .generalized import CameraMatches, rig_ransac
 from .pnp import PnpOptions, ransac
 
-LEAST_COMMON = 1e-4
-"""Least standard deviation of the common factor, of which sensors may state 0."""
+BEHIND_PX = 1e6
+"""Residual of a point behind the camera that should see it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,8 @@ class TurnedMatches:
         pixels: (T, 2) where the reference of each sees it.
         view: (T,) index of that reference.
         references: the references.
-        common_sigma: standard deviation of the logarithm of the factor that the depths share.
+        common_sigma: standard deviation of the logarithm of the factor that the depths share, at least that of their
+            mean.
         depth_sigma: standard deviation of a depth, as a share.
     """
 
@@ -82,7 +83,7 @@ class TurnedMatches:
         """The points of matches (T, 2) with these references (T,); all of their query's keypoints have a depth."""
         keypoint = matches[:, 0]
         rays = query.camera.rays(query.features.pixels(keypoint))
-        pixels = np.empty((len(matches), 2))
+        pixels, sigma = np.empty((len(matches), 2)), float(np.median(depths.relative_sigma[keypoint]))
         for i, reference in enumerate(references):
             pixels[view == i] = reference.view.features.pixels(matches[view == i, 1])
         return TurnedMatches(
@@ -90,8 +91,8 @@ class TurnedMatches:
             pixels,
             view,
             tuple(references),
-            max(depths.common_sigma, LEAST_COMMON),
-            float(np.median(depths.relative_sigma[keypoint])),
+            max(depths.common_sigma, sigma / math.sqrt(len(matches))),
+            sigma,
         )
 
     def __len__(self) -> int:
@@ -119,7 +120,7 @@ class TurnedMatches:
         x = np.einsum("tij,tj->ti", rotation, world_from_query.apply(x_in_query)) + translation
         in_front = x[:, 2] > 1e-6
         x = np.where(in_front[:, None], x, [0.0, 0.0, 1.0])
-        residual = np.where(in_front[:, None], x[:, :2] / x[:, 2:] * focal + principal - self.pixels, 1e6)
+        residual = np.where(in_front[:, None], x[:, :2] / x[:, 2:] * focal + principal - self.pixels, BEHIND_PX)
         by_point = normalize_jacobian(x) * focal[:, :, None] @ (rotation @ world_from_query.rotation)
         by_depth = np.where(in_front[:, None], np.einsum("tij,tj->ti", by_point, x_in_query), 0.0)
         by_pose = np.concatenate([-by_point @ motion_jacobian(x_in_query), by_depth[:, :, None]], axis=2)

@@ -10,10 +10,10 @@ from support.scenes import random_for
 
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.bundle.estimate import PosedSupport, PoseEstimate, PoseStage
-from mapless_server.method.bundle.own_depth import checked, improved
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, PosedView, View
 from mapless_server.method.optim.optimize import moved
+from mapless_server.method.pose.own_depth import checked, improved
 from mapless_server.method.structure.model import PointMatches, Structure
 from mapless_server.method.structure.observations import FIRST_GUESS
 

@@ -13,7 +13,7 @@ near one another errors are shared, so they count as few.
 
 It is evidence, too. At a wrong pose a factor agrees with its prior by chance, and depths with one another where they
 differ by more than their errors: the chances multiply. But a photograph may come with another one's depth, or in
-another unit. So depths that disagree speak against a pose as much as such mistakes are rare, and no more.
+another unit: of a hundred one, say. So depths that disagree speak against a pose by that, and no more.
 """
 
 from __future__ import annotations
@@ -27,35 +27,16 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
+from ..bundle.estimate import DepthCheck, PosedSupport, PoseEstimate
+from ..bundle.pose_problem import DRIFT_INFLATION, USUAL_DRIFT
+from ..bundle.priors import LIKELY_PROBABILITY, MIN_RELATIVE_INFORMATION, conflict_threshold, sharpened
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import cauchy_weight, moved, solve_columns, symmetric_products
 from ..structure.model import Structure
 from ..structure.structure import observe
-from .estimate import DepthCheck, PosedSupport, PoseEstimate
-from .pose_problem import DRIFT_INFLATION, USUAL_DRIFT
-from .priors import MIN_RELATIVE_INFORMATION, conflict_threshold, sharpened
-
-MIN_COMPARED = 12
-"""Fewer depths say nothing of a pose, as for one from depths (`pose.one_reference.MIN_INLIERS`)."""
-
-AGREES_SIGMA = 3.0
-"""Largest difference of a depth that agrees, in standard deviations."""
-
-LOSS_SCALE_SIGMA = 2.0
-"""Scale of the loss, as for poses from depths."""
-
-SHARED_DEPTHS = 20.0
-"""Matches whose depths count as one: those of one surface share the errors of the sensor."""
-
-ITERATIONS = 6
-"""Steps to the most probable factor."""
-
-LOG10_WRONG_DEPTH = -2.0
-"""log10 of the share of photographs whose depth is another's, or in another unit: assumed, not measured."""
-
-LN_RANGE = math.log(10.0)
-"""Range of the logarithm in which a factor is by chance: depths of another place are often of the same magnitude."""
+from .one_reference import INLIER_SIGMA, ITERATIONS, MAD_TO_SIGMA, MIN_INLIERS, SHARED_MATCHES
+from .pnp import LN_10
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,17 +72,17 @@ class DepthComparison:
         value, expected = float(np.median(self.log_ratio)), self.expected(covariance)
         for _ in range(ITERATIONS):
             squared = (self.log_ratio - value) ** 2 / expected
-            weight = cauchy_weight(squared, LOSS_SCALE_SIGMA) / self.variance
+            weight = cauchy_weight(squared, 2.0) / self.variance
             value = float(weight @ self.log_ratio / weight.sum())
-        return value, weight / max(1.0, len(self) / SHARED_DEPTHS)
+        return value, weight / max(1.0, len(self) / SHARED_MATCHES)
 
     def check(self, covariance: Array) -> DepthCheck:
         """How the depths compare with a pose of this covariance (6, 6)."""
-        if len(self) < MIN_COMPARED:
+        if len(self) < MIN_INLIERS:
             return DepthCheck(self.keypoint_count, len(self))
         factor, weight = self.factor(covariance)
         mean = weight @ self.jacobian / weight.sum()
-        agrees = (self.log_ratio - factor) ** 2 < AGREES_SIGMA**2 * self.expected(covariance)
+        agrees = (self.log_ratio - factor) ** 2 < INLIER_SIGMA**2 * self.expected(covariance)
         expected = self.prior_variance + 1 / weight.sum() + float(mean @ covariance @ mean)
         conflict = bool(2 * agrees.sum() < len(self) or factor**2 > conflict_threshold(1) * expected)
         sigma = math.sqrt(1 / weight.sum())
@@ -112,10 +93,10 @@ class DepthComparison:
         if not check.factor:
             return 0.0
         if check.conflict:
-            return -LOG10_WRONG_DEPTH
-        of_factor = 2 * math.sqrt(conflict_threshold(1) * self.prior_variance) / LN_RANGE
-        of_depth = 2 * AGREES_SIGMA * float(np.median(np.sqrt(self.variance))) / max(self.spread, 1e-9)
-        agreeing = (2 * check.agreeing_count - len(self)) / SHARED_DEPTHS
+            return -math.log10(LIKELY_PROBABILITY)
+        of_factor = 2 * math.sqrt(conflict_threshold(1) * self.prior_variance) / LN_10
+        of_depth = 2 * INLIER_SIGMA * float(np.median(np.sqrt(self.variance))) / max(self.spread, 1e-9)
+        agreeing = (2 * check.agreeing_count - len(self)) / SHARED_MATCHES
         return min(0.0, math.log10(of_factor)) + max(0.0, agreeing) * min(0.0, math.log10(of_depth))
 
     def gradient_and_information(self, covariance: Array) -> tuple[Array, Array]:
@@ -153,7 +134,7 @@ def compare_depths(support: PosedSupport) -> DepthComparison | None:
         np.log(depths.depth[keypoint].astype(np.float64)) - log_z,
         depths.relative_sigma[keypoint].astype(np.float64) ** 2 + of_points,
         jacobian,
-        1.4826 * float(np.median(np.abs(log_z - median))) if len(z) else 0.0,
+        MAD_TO_SIGMA * float(np.median(np.abs(log_z - median))) if len(z) else 0.0,
         depths.common_sigma**2 + _held(support, point[usable], math.exp(median)),
     )
 
