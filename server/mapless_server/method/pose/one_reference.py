@@ -241,7 +241,8 @@ def _planes(
     normal = np.array([it.world_from_camera.rotation[:, 2] for it in references])[view[:count]]
     depth = (normal * (problem.seen.x_in_world - problem.reference_centre)).sum(axis=1)
     offset = depth + (normal * problem.reference_centre).sum(axis=1)
-    common = np.array([it.common_sigma for it in depths])[view[:count]] * depth
+    common = np.zeros((count, 2))
+    common[:, 0] = np.array([it.common_sigma for it in depths])[view[:count]] * depth
     planes = DepthPlanes(normal, offset, (solved.depth_sigma * depth) ** -2.0, view[:count], common)
     return planes.and_last(DepthPlanes.unknown(len(view) - count))
 

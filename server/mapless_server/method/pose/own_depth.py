@@ -8,8 +8,8 @@ depths of the photograph share,
 
 for the viewing direction a, the camera's centre c and the point x. The factor has a prior, the sensor's own; what
 remains of e is a linear estimate with the pose's covariance C (Kalman), whose covariance is (C^-1 + H)^-1, with H the
-information of the depths. They are robust: Cauchy's loss, at the most probable factor without the prior. Of matches
-near one another errors are shared, so they count as few.
+information of the depths. They are robust: Cauchy's loss, at the most probable factor without the prior. Neighbours
+share errors, so they count as of `REGIONS` regions (see `structure.kept_depth`).
 
 It is evidence, too. At a wrong pose a factor agrees with its prior by chance, and depths with one another where they
 differ by more than their errors: the chances multiply. But a photograph may come with another one's depth, or in
@@ -33,9 +33,10 @@ from ..bundle.priors import LIKELY_PROBABILITY, MIN_RELATIVE_INFORMATION, confli
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import cauchy_weight, moved, solve_columns, symmetric_products
+from ..structure.kept_depth import REGIONS
 from ..structure.model import Structure
 from ..structure.structure import observe
-from .one_reference import INLIER_SIGMA, ITERATIONS, MAD_TO_SIGMA, MIN_INLIERS, SHARED_MATCHES
+from .one_reference import INLIER_SIGMA, ITERATIONS, MAD_TO_SIGMA, MIN_INLIERS
 from .pnp import LN_10
 
 
@@ -74,7 +75,7 @@ class DepthComparison:
             squared = (self.log_ratio - value) ** 2 / expected
             weight = cauchy_weight(squared, 2.0) / self.variance
             value = float(weight @ self.log_ratio / weight.sum())
-        return value, weight / max(1.0, len(self) / SHARED_MATCHES)
+        return value, weight
 
     def check(self, covariance: Array) -> DepthCheck:
         """How the depths compare with a pose of this covariance (6, 6)."""
@@ -96,7 +97,7 @@ class DepthComparison:
             return -math.log10(LIKELY_PROBABILITY)
         of_factor = 2 * math.sqrt(conflict_threshold(1) * self.prior_variance) / LN_10
         of_depth = 2 * INLIER_SIGMA * float(np.median(np.sqrt(self.variance))) / max(self.spread, 1e-9)
-        agreeing = (2 * check.agreeing_count - len(self)) / SHARED_MATCHES
+        agreeing = (2 * check.agreeing_count - len(self)) / REGIONS
         return min(0.0, math.log10(of_factor)) + max(0.0, agreeing) * min(0.0, math.log10(of_depth))
 
     def gradient_and_information(self, covariance: Array) -> tuple[Array, Array]:
@@ -127,12 +128,13 @@ def compare_depths(support: PosedSupport) -> DepthComparison | None:
     usable = np.isfinite(of_points) & (z > 0)
     z, offset, keypoint, of_points = z[usable], offset[usable], keypoint[usable], of_points[usable]
     jacobian = np.concatenate([np.broadcast_to(-axis, (len(z), 3)), np.cross(axis, offset)], axis=1) / z[:, None]
+    shared = depths.common_sigma**2 * len(z) / REGIONS
     log_z = np.log(z)
     median = float(np.median(log_z)) if len(z) else 0.0
     return DepthComparison(
         int(np.isfinite(depths.depth).sum()),
         np.log(depths.depth[keypoint].astype(np.float64)) - log_z,
-        depths.relative_sigma[keypoint].astype(np.float64) ** 2 + of_points,
+        depths.relative_sigma[keypoint].astype(np.float64) ** 2 + of_points + shared,
         jacobian,
         MAD_TO_SIGMA * float(np.median(np.abs(log_z - median))) if len(z) else 0.0,
         depths.common_sigma**2 + _held(support, point[usable], math.exp(median)),
@@ -206,6 +208,10 @@ def _held(support: PosedSupport, point: NDArray[np.intp], depth: float) -> float
     share = DRIFT_INFLATION * USUAL_DRIFT * structure.noise.level_px / focal_px
     stated = [it.provenance.accuracy.position_68_m for it in references if it.provenance.accuracy is not None]
     of_depths = (
-        0.0 if structure.planes is None else float(np.median(structure.planes.common[point])) if len(point) else 0.0
+        0.0
+        if structure.planes is None
+        else float(np.median(np.linalg.norm(structure.planes.common[point], axis=1)))
+        if len(point)
+        else 0.0
     )
     return share**2 + (max(stated, default=0.0) / depth) ** 2 + (of_depths / depth) ** 2
