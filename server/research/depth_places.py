@@ -16,6 +16,7 @@ runs.
 import argparse
 import asyncio
 import hashlib
+import itertools
 import json
 import pickle
 import tempfile
@@ -204,6 +205,41 @@ def _ratio(count: int, total: int) -> str:
     return f"{count} of {total} ({low:.0f} to {high:.0f} %)"
 
 
+class DepthFrames:
+    """Frames with depth: which see the same."""
+
+    def __init__(self, frames: Sequence[Frame]) -> None:
+        self._frames = frames
+        self._depths = [_measured(it) if it.depth else None for it in frames]
+        self._points = [_points(it, depth) for it, depth in zip(frames, self._depths, strict=True)]
+
+    def median_m(self, i: int) -> float:
+        """Median depth of a frame; 0 without depth."""
+        return self._points[i][1]
+
+    def pairs(self, count: int) -> Iterator[tuple[int, int]]:
+        """At most so many pairs of a reference and a photograph that shows half of it, in a random but fixed order."""
+        indices = range(len(self._frames))
+        chosen = [(i, j) for i in indices for j in indices if i != j]
+        np.random.default_rng(0).shuffle(chosen)
+        seen = ((i, j) for i, j in chosen if self._frames[i].depth and self._visible_share(i, j) >= MIN_VISIBLE)
+        yield from itertools.islice(seen, count)
+
+    def _visible_share(self, i: int, j: int) -> float:
+        """Share of a frame's points that another one's photograph shows."""
+        camera, x = self._frames[j].camera, self._frames[j].world_from_camera.inverse().apply(self._points[i][0])
+        in_front = x[:, 2] > 0
+        pixels = camera.project(np.where(in_front[:, None], x, [0.0, 0.0, 1.0]))
+        inside = in_front & ((pixels >= 0) & (pixels < (camera.width_px, camera.height_px))).all(axis=1)
+        measured = self._depths[j]
+        if measured is None:
+            return float(inside.mean())
+        height, width = measured.depth.shape
+        column, row = np.rint(measured.camera.project(x[inside])).astype(int).T
+        there = measured.depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+        return float((~(x[inside, 2] > (1 + HIDDEN_SHARE) * there)).sum() / len(x))
+
+
 class _Place:
     """A folder whose frames are all stored, with their depth in one scene and without in another."""
 
@@ -216,8 +252,7 @@ class _Place:
         tiers = [with_cache(it, cache) for it in make_tiers(settings)]
         self._engine: QueueEngine = engine_over(self._store, tiers, EngineOptions(workers=1))
         self._loop.run_until_complete(self._add())
-        self._depths = [_measured(it) if it.depth else None for it in self._frames]
-        self._points = [_points(it, depth) for it, depth in zip(self._frames, self._depths, strict=True)]
+        self._depths = DepthFrames(self._frames)
 
     def close(self) -> None:
         """Ends the engine and deletes the store."""
@@ -228,10 +263,7 @@ class _Place:
 
     def outcomes(self, pairs: int, queries: int, counts: Sequence[int]) -> Iterator[Outcome]:
         """Those of one reference, and of several."""
-        chosen = [(i, j) for i in range(len(self._frames)) for j in range(len(self._frames)) if i != j]
-        np.random.default_rng(0).shuffle(chosen)
-        seen = ((i, j) for i, j in chosen if self._frames[i].depth and self._visible_share(i, j) >= MIN_VISIBLE)
-        for (i, j), _ in zip(seen, range(pairs), strict=False):
+        for i, j in self._depths.pairs(pairs):
             yield self._outcome("one", [i], self._frames[j], has_depth=True)
         for count in counts:
             few = np.unique(np.linspace(0, len(self._frames) - 1, count).round().astype(int)).tolist()
@@ -274,7 +306,7 @@ class _Place:
         ids = tuple(f"r{i}" for i in references)
         query = Query(WITH if has_depth else WITHOUT, ids, photo, ANYWHERE, 10, LocalizeOptions(), is_generic=True)
         result = self._loop.run_until_complete(self._engine.run(self._engine.query_job(query, _caller())))
-        outcome, median_m = result.answer.outcome, float(np.median([self._points[i][1] for i in references]))
+        outcome, median_m = result.answer.outcome, float(np.median([self._depths.median_m(i) for i in references]))
         rung = next((it.rung for it in result.attempts if it.is_chosen), "")
         spent_s = sum(it.processor_s for it in result.attempts)
         about = self._name, kind, len(references), has_depth, frame.name, median_m
@@ -289,20 +321,6 @@ class _Place:
             scaled = SCALES.get(self._name, 1.0) * (outcome.world_from_camera.translation - centre)
             error_m = float(np.linalg.norm(centre + scaled - frame.world_from_camera.translation))
         return Outcome(*about, error_m, error_deg, *ratios, "", rung, spent_s)
-
-    def _visible_share(self, i: int, j: int) -> float:
-        """Share of a frame's points that another one's photograph shows."""
-        camera, x = self._frames[j].camera, self._frames[j].world_from_camera.inverse().apply(self._points[i][0])
-        in_front = x[:, 2] > 0
-        pixels = camera.project(np.where(in_front[:, None], x, [0.0, 0.0, 1.0]))
-        inside = in_front & ((pixels >= 0) & (pixels < (camera.width_px, camera.height_px))).all(axis=1)
-        measured = self._depths[j]
-        if measured is None:
-            return float(inside.mean())
-        height, width = measured.depth.shape
-        column, row = np.rint(measured.camera.project(x[inside])).astype(int).T
-        there = measured.depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-        return float((~(x[inside, 2] > (1 + HIDDEN_SHARE) * there)).sum() / len(x))
 
 
 @dataclass(frozen=True)

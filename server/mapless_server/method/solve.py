@@ -23,6 +23,7 @@ from .judge.judge import (
     contradiction,
     judge,
     one_reference_failure,
+    one_reference_radius_failure,
     too_uncertain,
     trust_of_own_depth,
     trust_of_score,
@@ -166,6 +167,8 @@ def _by_depths(
         if rejection := too_uncertain(support, MAX_GUESSED_RADIUS_SHARE):
             return coarse.answer(rejection, support)
     failure = one_reference_failure(found, trust, prepared.options.coverage)
+    if prepared.query.depths is None:
+        failure = failure or one_reference_radius_failure(found)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
     return coarse.answer(replace(Localization.of(estimate, trust), scale_source=source), support)

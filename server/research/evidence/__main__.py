@@ -32,6 +32,7 @@ MODULES = {
     "rungs": ("rungs",),
     "readings": ("readings", "suspects"),
     "depth_errors": ("depth-errors",),
+    "depth_scores": ("depth-scores", "depth-radius"),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }
 """The keys of each module, by its MEASUREMENTS; a module is imported when one of them is measured."""

@@ -216,6 +216,19 @@ def test_a_pose_is_accepted_at_a_trust_of_its_own() -> None:
     assert "a coverage of 0.2 requires" in outcome.message
 
 
+def test_matches_on_a_small_thing_know_no_position() -> None:
+    """A tenth of the image's sides has hundreds of right matches, which fit poses far apart."""
+    given = planted(random_for("small thing"), Errors(wrong_share=0.0), count=6000)
+    pixels = given.reference.view.features.keypoints[given.matches[:, 1]]
+    inside = np.flatnonzero((np.abs(pixels - [160, 120]) < [16, 12]).all(axis=1))
+    assert len(inside) > 40
+    found(replace(given, matches=given.matches[:: len(pixels) // len(inside)]))
+    outcome = answer_to(replace(given, matches=given.matches[inside])).outcome
+    assert isinstance(outcome, Rejection)
+    assert outcome.reason is RejectionReason.GATE
+    assert "95 % radius" in outcome.message
+
+
 @pytest.mark.parametrize("broken", ["pose", "depth", "few"])
 def test_broken_output_is_rejected(broken: str) -> None:
     given = planted(random_for("broken"), Errors(), count=150 if broken != "few" else 12)

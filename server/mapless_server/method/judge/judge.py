@@ -73,12 +73,15 @@ LEVELS = (
 """Shares of the right answers at which `JudgeOptions.scores` are the quantiles."""
 
 ONE_REFERENCE_SCORES = (
-    39.6, 39.6, 39.6, 39.8, 40.9, 58.2, 66.6, 127.2, 165.8, 185.0,
-    272.3, 487.4, 628.0, 838.7, 945.9, 1291.4, 1647.3, 2464.5, 3837.8, 4685.0,
+    24.5, 24.5, 24.5, 24.5, 25.2, 33.5, 38.6, 44.0, 63.1, 86.9,
+    109.8, 162.3, 271.0, 360.9, 491.1, 698.1, 961.1, 1254.3, 1632.0, 2947.7,
 )  # fmt: skip
-"""Quantiles, at `LEVELS`, of the scores of right answers (`Found.score`), of 138 pairs of photographs of nine places,
-each of which counts alike, with depths triangulated from other photographs, an error of 3 % common to all of them and
-of 5 % of each."""
+"""Quantiles, at `LEVELS`, of the scores of right answers (`Found.score`), on the one of four places with measured depth
+where they have the least evidence. Evidence: depth-scores."""
+
+MAX_ONE_REFERENCE_RADIUS_SHARE = 0.04
+"""Largest 95 % radius of a position from one reference, without the error that all depths share, as a share of the
+distance: a few matches on a small or flat thing fit poses that are farther apart. Evidence: depth-radius."""
 
 
 OWN_DEPTH_SCORES = (
@@ -215,6 +218,16 @@ def one_reference_failure(found: Found, trust: float, coverage: float) -> str | 
         required = f"the {round(1 - coverage, 6):g} that a coverage of {coverage:g} requires"
         return f"its trust of {np.floor(1000 * trust) / 1000:g} is below {required}: {count} with a single reference"
     return None
+
+
+def one_reference_radius_failure(found: Found) -> str | None:
+    """Says in one sentence that the matches hardly determine the position; None if they do."""
+    radius = accuracy_from_covariance(found.own_covariance).position_95_m / found.support.distance_m()
+    if radius <= MAX_ONE_REFERENCE_RADIUS_SHARE:
+        return None
+    inliers, largest = found.support.estimate.inliers, f"{100 * MAX_ONE_REFERENCE_RADIUS_SHARE:g} % is the most"
+    count = f"{inliers.sum()} of {len(inliers)} matches agree on a pose"
+    return f"{count}, which know the position to {100 * radius:.1f} % of the distance (95 % radius), {largest}"
 
 
 def format_evidence(evidence: Evidence) -> str:

@@ -94,11 +94,13 @@ class Found:
         support: support with the estimate; its points have their depths.
         score: the larger, the less likely are so many inliers among wrong matches.
         moved_score: the same for those matches that are at other pixels than in the reference; see `judge.references`.
+        own_covariance: (6, 6) the estimate's without the error that all depths share.
     """
 
     support: PosedSupport
     score: float
     moved_score: float
+    own_covariance: Array
 
 
 def solve_by_depths(
@@ -128,10 +130,9 @@ def solve_by_depths(
     pose = solved.world_from_camera
     nearest = int(np.bincount(view[solved.inliers], minlength=len(references)).argmax())
     centre = references[nearest].world_from_camera.translation
-    covariance = _covariance(problem, solved)
-    covariance += _reference_covariance(problem, solved, centre)
+    covariance = own = _covariance(problem, solved) + _reference_covariance(problem, solved, centre)
     if problem.turned is None or len(problem.turned) < len(view):
-        covariance += scale_covariance(pose, centre, depths[nearest].common_sigma)
+        covariance = own + scale_covariance(pose, centre, depths[nearest].common_sigma)
     estimate = PoseEstimate(pose, PoseStage.REFINED, solved.inliers, solved.errors_px, covariance)
     rows = np.arange(len(matches))
     structure = Structure(
@@ -147,7 +148,7 @@ def solve_by_depths(
     for i, (reference, its) in enumerate(zip(references, used, strict=True)):
         moved[view == i] = are_moved(query, reference, its, its, stationary)
     some = replace(solved, inliers=solved.inliers[moved], errors_px=solved.errors_px[moved])
-    return Found(support, score_of(problem, solved), score_of(problem[moved], some))
+    return Found(support, score_of(problem, solved), score_of(problem[moved], some), own)
 
 
 @dataclass(frozen=True, eq=False)
