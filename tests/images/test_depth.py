@@ -51,6 +51,7 @@ def test_depths_of_less_confidence_are_not_used() -> None:
 
 BAD = {
     "all zero": (replace(DEPTH, data=png(np.zeros_like(STEPS))), "DEPTH_EMPTY", ""),
+    "of few pixels": (replace(DEPTH, data=png(STEPS[:3, :4])), "IMAGE_TOO_SMALL", ".png"),
     "all 65535": (replace(DEPTH, data=png(np.full_like(STEPS, 65535))), "DEPTH_EMPTY", ""),
     "all NaN": (DepthImage.of_metres(np.full_like(METRES, np.nan)), "DEPTH_EMPTY", ""),
     "negative": (DepthImage.of_metres(-METRES), "DEPTH_NEGATIVE", ".float32"),

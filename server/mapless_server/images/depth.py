@@ -55,7 +55,7 @@ def check_depth(depth: DepthImage, photo: tuple[int, int], limits: ImageLimits, 
         raise InvalidArgument(message, reason="DEPTH_SIZE", field=f"{field}.intrinsics")
     if depth.confidence:
         path = f"{field}.confidence"
-        if (found := _checked_png(depth.confidence, 8, limits, path)) != size:
+        if (found := _checked_png(depth.confidence, 8, replace(limits, min_side_px=1), path)) != size:
             message = f"the confidence is {found[0]}x{found[1]} pixels, the depth {size[0]}x{size[1]}"
             raise InvalidArgument(message, reason="DEPTH_SIZE", field=path)
 
@@ -90,7 +90,7 @@ def _checked_png(data: bytes, bits: int, limits: ImageLimits, field: str) -> tup
     """Width and height of a PNG with one channel of so many bits, by its header."""
     if not data.startswith(_PNG):
         raise InvalidArgument(f"must be a PNG with one channel of {bits} bits", reason="DEPTH_NOT_PNG", field=field)
-    size = image_size(data, replace(limits, min_side_px=1), field)
+    size = image_size(data, limits, field)
     if data[_BITS] != bits or data[_COLOUR] != _GREY:
         message = (
             f"the PNG must have one channel of {bits} bits, has {data[_BITS]} bits and colour type {data[_COLOUR]}"

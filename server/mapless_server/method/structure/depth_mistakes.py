@@ -32,8 +32,8 @@ from ..significance import is_significant, sigmas_of_gains
 from .measured_depth import MeasuredDepth
 from .seen_depths import SeenDepths
 
-MIN_PLACES = 16
-"""Fewer places say nothing, nor does a group with fewer than half of them."""
+MIN_PLACES = 24
+"""Fewer places say nothing, as of matches, nor does a group with fewer than half of them."""
 OWN_SIGMAS = 1.645
 """By so much the triangulated points alone must prefer another reading: 5 % of right depths do so by chance."""
 AGREEING_SIGMA, FITTING_SHARE = 3.0, 0.9
@@ -132,7 +132,7 @@ def judge_depth(subject: PosedView, depth: MeasuredDepth, seen: SeenDepths) -> D
     common = LARGEST_COMMON if depth.noise == NOISE[DepthSensor.UNKNOWN] else depth.noise.common
     factor_mistake = _wrong_factor(verdict, common)
     factor_doubt = "" if factor_mistake else _differing_factor(verdict, common)
-    text, own_sigmas = compared.misread(share)
+    text, own_sigmas = compared.misread()
     # The factor of an image that is misread says nothing.
     mistake = text if text and own_sigmas >= OWN_SIGMAS else factor_mistake
     doubt = text if text and abs(own_sigmas) < OWN_SIGMAS else factor_doubt
@@ -242,22 +242,25 @@ class _Compared:
         residual = residual[np.isfinite(residual)]
         return len(residual), float(np.mean(np.abs(residual) <= AGREEING_SIGMA)) if len(residual) else np.nan
 
-    def misread(self, given_share: float) -> tuple[str, float]:
+    def misread(self) -> tuple[str, float]:
         """The clause about the reading that explains the places best, if it does so significantly; else empty.
 
         Also by how many standard deviations the triangulated points alone prefer it. A reading is named under which
-        these fit; without one, the image is that of something else if neither they nor all places fit as given.
+        these and all places fit; without one, the image is that of something else if neither of them fit as given.
         """
         found = [it for it in self._gains() if is_significant(it[1], tested=len(READINGS) - 1)]
-        named = [it for it in found if not READINGS[it[0]].is_flat and not self.agreeing(it[0])[1] < FITTING_SHARE]
+        named = [it for it in found if not READINGS[it[0]].is_flat and self._least_share(it[0]) >= FITTING_SHARE]
         if named:
             row, _, own_sigmas = max(named, key=lambda it: (self._share_of_all(it[0]), it[1]))
             return self._text(row), own_sigmas
-        if found and np.fmax(given_share, self._share_of_all(0)) < FITTING_SHARE:
-            count, share = self.agreeing(0)
+        count, share = self.agreeing(0)
+        if found and count >= MIN_PLACES and max(share, self._share_of_all(0)) < FITTING_SHARE:
             text = f"it does not fit the photograph, as another one's: {100 * share:.0f} % of {count} points agree"
             return text, max(own_sigmas for _, _, own_sigmas in found)
         return "", np.inf
+
+    def _least_share(self, row: int) -> float:
+        return float(np.fmin(self.agreeing(row)[1], self._share_of_all(row)))
 
     def _share_of_all(self, row: int) -> float:
         """Share of the places with a depth under a reading that agree; 0 without any."""
