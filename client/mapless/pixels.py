@@ -61,8 +61,9 @@ def _size_of_jpeg(data: bytes) -> tuple[int, int]:
 
 
 def _size_of_png(data: bytes) -> tuple[int, int]:
-    """Reads the chunk IHDR, which is always the first."""
+    """Reads the chunk IHDR, which is always the first, and must be there with all of its 13 bytes."""
     width, height = _big(data, 16, 4), _big(data, 20, 4)
+    _take(data, 16, 13)
     if data[12:16] != b"IHDR":
         raise BadHeader("the PNG does not begin with its header", "IMAGE_UNDECODABLE")
     return width, height

@@ -148,6 +148,7 @@ def test_a_claim_of_900_megapixels_is_refused_from_the_header() -> None:
         (b"\xff\xd8" + b"\xff\xfe\x00\x02" * 2**21, "IMAGE_TOO_COMPLEX"),
         (b"\xff\xd8" + b"\xff\xd0" * 2**22, "IMAGE_TOO_COMPLEX"),
         (FILES["png"][:20], "IMAGE_TRUNCATED"),
+        (FILES["png"][:24], "IMAGE_TRUNCATED"),
         (FILES["lossy webp"][:28], "IMAGE_TRUNCATED"),
         (FILES["png"].replace(b"IHDR", b"IHDX", 1), "IMAGE_UNDECODABLE"),
         (with_scans(FILES["jpeg"], 200), "IMAGE_TOO_COMPLEX"),

@@ -92,6 +92,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str, str]] = {
         "transparent",
     ),
     "cut": (lambda: png(grey())[:-30], "IMAGE_UNDECODABLE", "cut off"),
+    "cut in its header": (lambda: png(grey())[:24], "IMAGE_TRUNCATED", "within its header"),
 }
 
 

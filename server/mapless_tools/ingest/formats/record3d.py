@@ -65,9 +65,9 @@ def _pose(poses: list[Any], number: int) -> RigidTransform:
 
 
 def _camera(content: Mapping[str, Any], number: int, size: tuple[int, int]) -> Camera:
-    said = tuple(finite_numbers([content.get("w"), content.get("h")], "w and h", (2,)).astype(int).tolist())
+    said = tuple(finite_numbers([content.get("w"), content.get("h")], "w and h", (2,)).tolist())
     if said != size:
-        raise ValueError(f"w and h are {said[0]}x{said[1]}, the image is {size[0]}x{size[1]}")
+        raise ValueError(f"w and h are {said[0]:g}x{said[1]:g}, the image is {size[0]}x{size[1]}")
     coefficients = content.get("perFrameIntrinsicCoeffs")
     if isinstance(coefficients, list) and number < len(coefficients):
         k = finite_numbers(coefficients[number], f"perFrameIntrinsicCoeffs[{number}]", (4,))
