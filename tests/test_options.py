@@ -13,7 +13,7 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     "method.coarse.token_cache.TokenCacheOptions": [("device_bytes", -1)],
     "method.features.matching.CorrespondOptions": [("reference_ratio", 1.1), ("query_ratio", 0.0), ("epipolar_px", NAN)]
     + [("distinct_ratio", 2.0), ("guided_similarity", -2.0)],
-    "method.features.extractors.network.LearnedOptions": [("max_keypoints", 0), ("max_side_px", 8), ("min_score", 1.0)]
+    "method.features.extractors.options.LearnedOptions": [("max_keypoints", 0), ("max_side_px", 8), ("min_score", 1.0)]
     + [("min_score", NAN)],
     "method.features.extractors.sift.SiftOptions": [
         ("max_keypoints", 0),

@@ -11,6 +11,8 @@ _EXTRA_OF = {
     "kornia": "networks",
     "matplotlib": "tools",
     "OpenEXR": "tools",
+    "onnx": "edgepoint2",
+    "onnxruntime": "edgepoint2",
     "opentelemetry": "otel",
     "pillow_heif": "reconstruct",
     "pycolmap": "reconstruct",

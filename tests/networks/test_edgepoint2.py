@@ -10,10 +10,13 @@ from support.scenes import random_for
 torch = pytest.importorskip("torch", reason="the networks extra is not installed")
 
 import torch.nn.functional as F  # noqa: E402, N812  its usual name
+from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor  # noqa: E402
 
-from mapless_server.networks.edgepoint2 import VARIANTS, EdgePoint2, fuse  # noqa: E402
+from mapless_server.networks.edgepoint2 import EdgePoint2, TorchEdgePoint2, fuse  # noqa: E402
+from mapless_server.networks.edgepoint2_sizes import VARIANTS  # noqa: E402
 from mapless_server.networks.local_features import load_edgepoint2  # noqa: E402
+from mapless_server.networks.weights import CheckpointError  # noqa: E402
 
 FOLDER = Path(os.environ.get("TEST_EDGEPOINT2") or Path(__file__).parents[3] / "shared" / "weights" / "edgepoint2")
 """Where `fixture.npz` and the weights S64.safetensors and so on are: they are not part of the project."""
@@ -82,6 +85,38 @@ def test_the_fused_network_computes_the_same(variant: str) -> None:
     assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in network.modules())
     for ours in found:
         torch.testing.assert_close(ours, expected, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("size", [(96, 130), (64, 320), (9, 7)])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_onnx_runtime_computes_the_same(variant: str, size: tuple[int, int], tmp_path: Path) -> None:
+    onnx = pytest.importorskip("mapless_server.networks.edgepoint2_onnx", reason="ONNX Runtime is not installed")
+    file = tmp_path / "weights.safetensors"
+    save_file(random_network(variant).state_dict(), file)
+    grey = random_for("grey", size).integers(0, 256, size).astype(np.uint8)
+    plain, ours = TorchEdgePoint2(variant, file), onnx.OnnxEdgePoint2(variant, file)
+    assert plain.sha256 == ours.sha256
+    (logits, features), (our_logits, our_features) = plain.maps(grey), ours.maps(grey)
+    np.testing.assert_allclose(our_logits, logits, atol=1e-3, rtol=1e-4)
+    np.testing.assert_allclose(our_features, features, atol=1e-3, rtol=1e-4)
+    samples = features.reshape(len(features), -1).T[:50].copy()
+    np.testing.assert_allclose(ours.describe(samples), plain.describe(samples), atol=1e-3, rtol=1e-4)
+
+
+def test_onnx_names_the_weights_that_do_not_fit(tmp_path: Path) -> None:
+    onnx = pytest.importorskip("mapless_server.networks.edgepoint2_onnx", reason="ONNX Runtime is not installed")
+    state = dict(random_network("s64").state_dict())
+    for change, words in (
+        ({"conv1.bias": torch.zeros(9)}, "of another shape: conv1.bias is"),
+        ({"another": torch.zeros(2)}, "1 surplus: another"),
+        ({"conv1.bias": torch.full((8,), torch.nan)}, "not finite, in conv1.bias"),
+    ):
+        file = tmp_path / "changed.safetensors"
+        save_file(state | change, file)
+        with pytest.raises(CheckpointError, match=words):
+            onnx.OnnxEdgePoint2("s64", file)
+    with pytest.raises(CheckpointError, match="does not fit EdgePoint2"):
+        onnx.OnnxEdgePoint2("l64", file)
 
 
 def test_contrast_and_brightness_do_not_change_a_padded_image() -> None:

@@ -82,7 +82,8 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
     pytest.importorskip("torch")
     from safetensors.torch import save_file
 
-    from mapless_server.networks.edgepoint2 import VARIANTS, EdgePoint2
+    from mapless_server.networks.edgepoint2 import EdgePoint2
+    from mapless_server.networks.edgepoint2_sizes import VARIANTS
 
     (tmp_path / "weights").mkdir()
     save_file(EdgePoint2(VARIANTS["l64"]).state_dict(), tmp_path / "weights" / "edgepoint2-l64.safetensors")

@@ -5,50 +5,17 @@ network as described, but for the last layer of the descriptors, which is applie
 of it; `fuse` makes it compute the same in less time.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812  its usual name
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-MULTIPLE_PX = 32
-"""Sides of the images that the layers take; `EdgePoint2` pads others."""
-
-DESCRIPTOR_STEP_PX = 4
-"""Side of the pixels of the map that descriptors are computed from."""
-
-GROUP = 16
-"""Channels of a group of the descriptors' 3x3 convolution."""
-
-
-@dataclass(frozen=True)
-class Widths:
-    """Channels of the maps.
-
-    Attributes:
-        first: channels after the first convolution, at half resolution.
-        half, eighth, last: channels of the maps at 1/2, 1/8 and 1/32 of the resolution.
-        score: channels in which the scores of the three maps are added.
-        descriptor: numbers of a descriptor.
-    """
-
-    first: int
-    half: int
-    eighth: int
-    last: int
-    score: int
-    descriptor: int = 64
-
-
-VARIANTS: Mapping[str, Widths] = {
-    "s64": Widths(8, 8, 24, 32, 8),
-    "m64": Widths(8, 16, 32, 48, 8),
-    "l64": Widths(8, 16, 48, 64, 8),
-    "e64": Widths(16, 16, 48, 64, 16),
-}
-"""Widths of the official weights' networks, the cheapest first."""
+from .checkpoint import load_strictly
+from .edgepoint2_sizes import GROUP, MULTIPLE_PX, VARIANTS, Widths
 
 
 class Convolution(nn.Module):
@@ -140,6 +107,36 @@ class EdgePoint2(nn.Module):
         joined += _enlarge(F.conv2d(eighth, second, dilation=layer.dilation), 2)
         joined += _enlarge(F.conv2d(last, third, dilation=layer.dilation), 8)
         return joined
+
+
+class TorchEdgePoint2:
+    """EdgePoint2 "s64", "m64", "l64" or "e64" with the weights of a file; CheckpointError if they do not fit.
+
+    Attributes:
+        sha256: SHA-256 of the file, hexadecimal.
+    """
+
+    def __init__(self, variant: str, weights: Path, device: str = "cpu") -> None:
+        network = EdgePoint2(VARIANTS[variant])
+        self.sha256 = load_strictly(network, weights, optional={})
+        self._device = torch.device(device)
+        self._network = fuse(network.eval()).to(self._device)
+
+    @torch.inference_mode()
+    def maps(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Logits (H, W) and the map (C, H', W') for `describe` of a grey image (H, W)."""
+        # Transferred as bytes, a quarter of the size of floats.
+        image = torch.from_numpy(np.ascontiguousarray(grey)).to(self._device)[None, None].float() / 255
+        logits, features = self._network(image)
+        return logits[0, 0].cpu().numpy(), features[0].cpu().contiguous().numpy()
+
+    @torch.inference_mode()
+    def describe(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Descriptors (N, D), not normalized, of samples (N, C) of the map."""
+        described: NDArray[np.float32] = (
+            self._network.describe(torch.from_numpy(samples).to(self._device)).cpu().numpy()
+        )
+        return described
 
 
 def fuse(network: EdgePoint2) -> EdgePoint2:

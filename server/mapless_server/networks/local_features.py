@@ -44,7 +44,8 @@ def load_xfeat(weights: Path) -> tuple[XFeatModel, str]:
 
 def load_edgepoint2(variant: str, weights: Path) -> tuple[EdgePoint2, str]:
     """Loads a variant of EdgePoint2 ("s64", "m64", "l64", "e64"), with its weights' SHA-256."""
-    from .edgepoint2 import VARIANTS, EdgePoint2
+    from .edgepoint2 import EdgePoint2
+    from .edgepoint2_sizes import VARIANTS
 
     network = EdgePoint2(VARIANTS[variant])
     return network, load_strictly(network, weights, optional={})

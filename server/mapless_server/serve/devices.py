@@ -1,5 +1,7 @@
 """The device that networks compute on."""
 
+import ctypes
+
 
 def choose_device(device: str) -> str:
     """Chooses the device of networks; `auto` is a CUDA device if torch is installed and finds one, else the CPU.
@@ -17,8 +19,8 @@ def choose_device(device: str) -> str:
 
 
 def _find_device(device: str) -> str:
-    if device == "cpu":
-        return device
+    if device == "cpu" or (device == "auto" and not _has_driver()):
+        return "cpu"
     try:
         import torch
     except ImportError:
@@ -30,3 +32,12 @@ def _find_device(device: str) -> str:
     if torch.device(device).index not in (None, *range(torch.cuda.device_count())) or not torch.cuda.is_available():
         raise ValueError(f"there is no device {device}: torch finds {torch.cuda.device_count()} CUDA devices")
     return device
+
+
+def _has_driver() -> bool:
+    """Whether NVIDIA's driver is installed: without it there is no CUDA device, and torch need not be loaded."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True

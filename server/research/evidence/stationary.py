@@ -264,7 +264,7 @@ def _extractors() -> dict[str, FeatureExtractor]:
     weights = Path(os.environ.get("MAPLESS_WEIGHTS_DIR", "")) / "edgepoint2-l64.safetensors"
     if weights.is_file():
         from mapless_server.method.features.extractors.edgepoint2 import EdgePoint2Extractor
-        from mapless_server.method.features.extractors.network import LearnedOptions
+        from mapless_server.method.features.extractors.options import LearnedOptions
 
         options = LearnedOptions(max_keypoints=MAX_KEYPOINTS, min_score=0.0067)
         found["edgepoint2-l64"] = EdgePoint2Extractor("l64", weights, options=options)

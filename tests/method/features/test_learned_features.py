@@ -25,10 +25,12 @@ from torch import Tensor, nn  # noqa: E402
 
 from mapless_server.method.features.extractors.aliked import AlikedExtractor, Maps, describe, find_maps  # noqa: E402
 from mapless_server.method.features.extractors.edgepoint2 import SIZE_OF_WIDTH, EdgePoint2Extractor  # noqa: E402
-from mapless_server.method.features.extractors.network import LearnedOptions, image_tensor  # noqa: E402
+from mapless_server.method.features.extractors.network import image_tensor  # noqa: E402
+from mapless_server.method.features.extractors.options import LearnedOptions  # noqa: E402
 from mapless_server.method.features.extractors.xfeat import SHIFT_PX, XfeatExtractor  # noqa: E402
 from mapless_server.method.features.masks import MARGIN_PX  # noqa: E402
-from mapless_server.networks.edgepoint2 import VARIANTS, EdgePoint2  # noqa: E402
+from mapless_server.networks.edgepoint2 import EdgePoint2  # noqa: E402
+from mapless_server.networks.edgepoint2_sizes import VARIANTS  # noqa: E402
 from mapless_server.networks.weights import CheckpointError  # noqa: E402
 
 CAMERA = Camera(320, 256, 300.0, 300.0, 159.5, 127.5)
@@ -197,9 +199,9 @@ def test_edgepoint2_features_are_read_at_the_peaks_of_the_maps(
         logits = np.maximum(logits, 5 - 0.3 * ((x - cx) ** 2 + (y - cy) ** 2))
     # The middles of the 4x4 pixels that a descriptor is for: of an image that is padded to 320x256.
     column, row = np.meshgrid(np.arange(80) * 4 + 1.5, np.arange(64) * 4 + 1.5)
-    feature_map = np.stack([column, row, np.full(column.shape, 200.0)])[None]
-    maps = tuple(torch.from_numpy(it.astype(np.float32)) for it in (logits[None, None], feature_map))
-    monkeypatch.setattr(edgepoint2._network, "forward", lambda _: maps)
+    feature_map = np.stack([column, row, np.full(column.shape, 200.0)])
+    maps = tuple(it.astype(np.float32) for it in (logits, feature_map))
+    monkeypatch.setattr(edgepoint2._network, "maps", lambda _: maps)
     monkeypatch.setattr(edgepoint2._network, "describe", lambda samples: samples)
     camera = replace(CAMERA, height_px=250)
     view = edgepoint2.extract(np.zeros((250, 320, 3), np.uint8), camera)

@@ -17,7 +17,8 @@ from mapless_server.networks.local_features import load_aliked
 from ..limits import MULTIPLE_PX
 from ..masks import are_usable, usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
-from .network import LearnedOptions, array_of, image_tensor
+from .network import array_of, image_tensor
+from .options import LearnedOptions
 
 _CORNERS = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
 """Pixels around a position, x and y, from the first."""

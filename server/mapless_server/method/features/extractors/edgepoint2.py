@@ -1,21 +1,24 @@
 """EdgePoint2 (Yao et al. 2025) with the authors' weights."""
 
 import math
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch.nn.functional import grid_sample, normalize
 
 from mapless.geometry import Camera
-from mapless_server.networks.edgepoint2 import DESCRIPTOR_STEP_PX, fuse
-from mapless_server.networks.local_features import load_edgepoint2
+from mapless_server.networks.edgepoint2_sizes import DESCRIPTOR_STEP_PX
 
 from ..masks import usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
-from .network import WINDOW_PX, LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
+from .options import WINDOW_PX, LearnedOptions
+
+Float = NDArray[np.float32]
+Pixels = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Rows and columns (N,) of whole pixels."""
 
 SIZE_OF_WIDTH = 12.0
 """Size of a keypoint over the width of its peak along the flatter axis, the square root of the inverse curvature of the
@@ -23,6 +26,21 @@ logit: as that of an equally precise SIFT keypoint, so that sizes times the slop
 
 BORDER_PX = 4
 """Keypoints are at least so far from the image's border, where the network sees its padding."""
+
+
+class EdgePoint2Network(Protocol):
+    """The network: `OnnxEdgePoint2`, or with torch `TorchEdgePoint2`."""
+
+    sha256: str
+    """Identity of the weights."""
+
+    def maps(self, grey: NDArray[np.uint8]) -> tuple[Float, Float]:
+        """Logits (H, W) and the map (C, H', W') for `describe` of a grey image (H, W)."""
+        ...
+
+    def describe(self, samples: Float) -> Float:
+        """Descriptors (N, D), not normalized, of samples (N, C) of the map."""
+        ...
 
 
 class EdgePoint2Extractor:
@@ -34,43 +52,85 @@ class EdgePoint2Extractor:
 
     def __init__(self, variant: str, weights: Path, device: str = "cpu", options: LearnedOptions | None = None) -> None:
         self.options = options or LearnedOptions(min_score=0.0067)
-        network, sha256 = load_edgepoint2(variant, weights)
-        self._device = torch.device(device)
-        self._network = fuse(network.eval()).to(self._device)
-        self.name = self.options.label(f"edgepoint2-{variant}", sha256)
+        self._network = _network(variant, weights, device)
+        self.name = self.options.label(f"edgepoint2-{variant}", self._network.sha256)
 
-    @torch.inference_mode()
     def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:
         """See FeatureExtractor.extract; the strongest keypoint first."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         reduced, reduced_camera = reduce_image(grey, camera, self.options.max_side_px)
-        all_logits, feature_map = self._network(image_tensor(reduced, self._device))
-        logits = all_logits[0, 0]
-        margin = BORDER_PX - WINDOW_PX // 2
-        inner = logits[margin:-margin, margin:-margin]
-        pixels = strict_maxima(inner, WINDOW_PX, _logit(self.options.min_score)) + margin
+        logits, feature_map = self._network.maps(reduced)
+        row, column = _strict_maxima(logits, _logit(self.options.min_score))
         if ignored is not None:
-            pixels = among_usable(pixels, usable_pixels(ignored, reduced.shape[1], reduced.shape[0]))
-        order = torch.argsort(logits[pixels[:, 1], pixels[:, 0]], descending=True, stable=True)
-        pixels = pixels[order[: self.options.max_keypoints]]
-        offsets, curvatures = peaks(logits, pixels)
-        keypoints = pixels + offsets
+            usable = usable_pixels(ignored, reduced.shape[1], reduced.shape[0])[row, column]
+            row, column = row[usable], column[usable]
+        order = np.argsort(-logits[row, column], kind="stable")[: self.options.max_keypoints]
+        offsets, curvatures = _peaks(logits, (row[order], column[order]))
+        keypoints = np.stack([column[order], row[order]], axis=1) + offsets
+        described = self._network.describe(_sampled(feature_map, keypoints))
         return view_of(
             reduced_camera,
-            array_of(keypoints).astype(np.float64),
-            array_of(normalize(self._network.describe(_sampled(feature_map, keypoints)), dim=1)),
-            array_of(SIZE_OF_WIDTH / (-curvatures.amax(dim=1)).sqrt()),
+            keypoints.astype(np.float64),
+            described / np.maximum(np.linalg.norm(described, axis=1, keepdims=True), np.float32(1e-12)),
+            SIZE_OF_WIDTH / np.sqrt(-curvatures.max(axis=1)),
         )
+
+
+def _network(variant: str, weights: Path, device: str) -> EdgePoint2Network:
+    """By ONNX Runtime on a CPU where it is installed, which loads sooner; else by torch."""
+    if device == "cpu" and find_spec("onnxruntime") and find_spec("onnx"):
+        from mapless_server.networks.edgepoint2_onnx import OnnxEdgePoint2
+
+        return OnnxEdgePoint2(variant, weights)
+    from mapless_server.networks.edgepoint2 import TorchEdgePoint2
+
+    return TorchEdgePoint2(variant, weights, device)
 
 
 def _logit(score: float) -> float:
     return math.log(score / (1 - score)) if score > 0 else -math.inf
 
 
-def _sampled(feature_map: torch.Tensor, keypoints: torch.Tensor) -> torch.Tensor:
-    """Samples a map (1, D, H, W) at keypoints, (N, D); the map's pixels lie side by side from the image's corner on."""
-    height, width = feature_map.shape[2:]
-    size_px = DESCRIPTOR_STEP_PX * keypoints.new_tensor([width, height])
-    places = (2 * keypoints + 1) / size_px - 1  # -1 and 1 are the outer edges of the outermost pixels
-    sampled = grid_sample(feature_map, places[None, None], mode="bilinear", align_corners=False)
-    return sampled[0, :, 0].T
+def _strict_maxima(logits: Float, threshold: float) -> Pixels:
+    """Pixels above the threshold and all others of their window, which lies in the image but for its border."""
+    margin = WINDOW_PX // 2
+    others = np.ones((WINDOW_PX, WINDOW_PX), np.uint8)
+    others[margin, margin] = 0
+    inside = logits[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX]
+    if not inside.size:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    around = cv2.dilate(logits, others)[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX]
+    row, column = np.nonzero(inside > np.maximum(around, np.float32(threshold)))
+    return row + BORDER_PX, column + BORDER_PX
+
+
+def _peaks(logits: Float, at: Pixels) -> tuple[Float, Float]:
+    """Offsets (N, 2) from strict maxima to the peaks of parabolas through their neighbours, at most half a pixel.
+
+    Also the second derivatives (N, 2) of the parabolas, which are negative; both x and y.
+    """
+    row, column = at
+    here = logits[row, column]
+    before = np.stack([logits[row, column - 1], logits[row - 1, column]], axis=1)
+    after = np.stack([logits[row, column + 1], logits[row + 1, column]], axis=1)
+    curvatures = before + after - 2 * here[:, None]
+    return np.asarray((before - after) / 2 / curvatures), np.asarray(curvatures)
+
+
+def _sampled(feature_map: Float, keypoints: NDArray[np.floating]) -> Float:
+    """Samples a map (D, H, W) at keypoints, (N, D), between its pixels, which lie side by side from the image's corner.
+
+    Beyond the outermost pixels' centres it falls to zero.
+    """
+    places = (keypoints + 0.5) / DESCRIPTOR_STEP_PX - 0.5
+    first = np.floor(places).astype(np.intp)
+    right, low = (places - first).astype(np.float32).T
+    _, height, width = feature_map.shape
+    flat, sampled = feature_map.reshape(len(feature_map), -1), np.zeros((len(feature_map), len(places)), np.float32)
+    for down, across in (0, 0), (0, 1), (1, 0), (1, 1):
+        column, row = first[:, 0] + across, first[:, 1] + down
+        weight = (right if across else 1 - right) * (low if down else 1 - low)
+        weight *= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        pixel = row.clip(0, height - 1) * width + column.clip(0, width - 1)
+        sampled += np.take(flat, pixel, axis=1) * weight
+    return sampled.T

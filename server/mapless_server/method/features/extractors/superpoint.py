@@ -14,7 +14,8 @@ from mapless_server.networks.local_features import load_superpoint
 
 from ..masks import are_usable, usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
-from .network import LearnedOptions, array_of, image_tensor
+from .network import array_of, image_tensor
+from .options import LearnedOptions
 
 WINDOW_PX = 9
 """Side of the window in which a keypoint is the strongest pixel: transformers' default and LightGlue's training."""

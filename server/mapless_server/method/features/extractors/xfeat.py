@@ -14,7 +14,8 @@ from mapless_server.networks.local_features import load_xfeat
 from ..limits import MULTIPLE_PX
 from ..masks import usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
-from .network import WINDOW_PX, LearnedOptions, among_usable, array_of, image_tensor, peaks, strict_maxima
+from .network import among_usable, array_of, image_tensor, peaks, strict_maxima
+from .options import WINDOW_PX, LearnedOptions
 
 SHIFT_PX = 0.4
 """From a maximum of the keypoint map to the image point, right and down, pixels: the positions that the weights were
