@@ -26,8 +26,8 @@ from .library import ReferenceLibrary
 from .measured import read_measured
 from .retrieval.ranking import rank_beside
 
-NEIGHBOURS = 3
-"""References that each is compared with; a second and a third tell which of two depths is wrong."""
+NEIGHBOURS = 2
+"""References that each is compared with; the second shows which of two depths is wrong."""
 NAMED = 3
 """Wrong depths of a scene that are named."""
 _CACHED_VERDICTS, _CACHED_BYTES = 10_000, 32 * 2**20
@@ -40,6 +40,11 @@ class DepthCheck:
 
     verdict: DepthVerdict
     neighbours: tuple[str, ...]
+
+    @property
+    def is_alarm(self) -> bool:
+        """Whether this depth is wrong, or it or a neighbour's may be."""
+        return bool(self.verdict.mistake or self.verdict.doubt)
 
     @property
     def doubt(self) -> str:
@@ -121,7 +126,8 @@ class DepthChecks:
     def _depth(self, scene_key: SceneKey, view: PosedView) -> MeasuredDepth:
         found = self._depths.get(view.key)
         if found is None:
-            found = read_measured(self._store, self._store.get_reference(scene_key, _id_of(view)))
+            measured = read_measured(self._store, self._store.get_reference(scene_key, _id_of(view)))
+            found = measured.in_photograph(view.view.camera)
             self._depths.put(view.key, found, found.depth.nbytes)
         return found
 

@@ -88,7 +88,8 @@ class _Known:
 
     `sampled_size` is the number of its references when they were sampled, `explained` has the pairs by which it was
     explained, `measured` those by which its depth was measured; before `rests_until_s`, by `time.monotonic`, nothing is
-    derived again. `depths` are the results for depths by the ids of references, complete as of `depths_generation`.
+    derived again. `depths` are the results for depths by the ids of references, each with the number of depths that
+    there were, complete as of `depths_generation`.
     """
 
     errors_px: dict[Pair, float] = field(default_factory=dict)
@@ -98,7 +99,7 @@ class _Known:
     explained: _Basis = _Basis()
     measured: _Basis = _Basis()
     rests_until_s: float = -math.inf
-    depths: dict[str, DepthCheck] = field(default_factory=dict)
+    depths: dict[str, tuple[DepthCheck, int]] = field(default_factory=dict)
     depths_generation: int = -1
     update: "Future[None] | None" = None
 
@@ -263,9 +264,12 @@ class SceneAgreements:
         for reference_id in sorted(wanted, key=lambda it: it in known.depths):
             if time.monotonic() > begin_s + DEPTHS_S:
                 break
-            found = self._depths.check(scene_key, reference_id, self._check)
-            if found is not None:
-                known.depths[reference_id] = found
+            before, count = known.depths.get(reference_id, (None, 0))
+            # A right one may have better neighbours when there are many more; a wrong one may be corrected by others.
+            if before is None or before.is_alarm or len(wanted) >= KNOWN_GROWTH * count:
+                found = self._depths.check(scene_key, reference_id, self._check)
+                if found is not None:
+                    known.depths[reference_id] = found, len(wanted)
         else:
             known.depths_generation = generation
         with self._guard:
@@ -308,7 +312,7 @@ class SceneAgreements:
             found = replace(found, explanation=before.explanation)
         if found.agreeing_count and found.median_depth is None:
             found = replace(found, median_depth=before.median_depth)
-        found = replace(found, depths=tuple(depth_warnings(known.depths)))
+        found = replace(found, depths=tuple(depth_warnings({it: found for it, (found, _) in known.depths.items()})))
         new = [it for it in found.depths if it not in before.depths]
         with self._guard:
             known.agreement = found

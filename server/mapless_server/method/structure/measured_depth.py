@@ -72,13 +72,17 @@ class MeasuredDepth:
 
         Their camera comes first. `at_keypoints` interpolates between the same values.
         """
-        seen = self if self.camera_from_depth_camera is None else self.seen_by(camera)
+        seen = self.in_photograph(camera)
         return seen.camera, _inverse_without_edges(seen.depth, self.noise)
 
     def at_pixels(self, camera: Camera, pixels: Array) -> Array:
         """Depths (N,) at pixels (N, 2) of the photograph's camera, a pinhole; NaN where there is none."""
-        seen = self if self.camera_from_depth_camera is None else self.seen_by(camera)
+        seen = self.in_photograph(camera)
         return _depth_at(seen.depth, seen.camera.project(camera.rays(pixels)), self.noise)
+
+    def in_photograph(self, camera: Camera) -> "MeasuredDepth":
+        """The depths in a depth image of the photograph's own place: these, if they are, or as `seen_by` its camera."""
+        return self if self.camera_from_depth_camera is None else self.seen_by(camera)
 
     def seen_by(self, camera: Camera) -> "MeasuredDepth":
         """The depths as a camera (a pinhole) sees them that is at the photograph's place."""
@@ -88,16 +92,15 @@ class MeasuredDepth:
         )
         width, height = (max(1, round(side * min(density, 1.0))) for side in (camera.width_px, camera.height_px))
         target = camera.resized(width, height)
-        pixels, depth = self._seen_pixels(target)
+        column, row, depth = self._seen_pixels(target)
         with np.errstate(invalid="ignore"):
-            inside = (depth > 0) & (pixels >= 0).all(axis=0) & (pixels[0] < width) & (pixels[1] < height)
-        columns, rows = pixels[:, inside]
+            inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         nearest = np.full(width * height, np.inf, np.float32)
-        np.minimum.at(nearest, (rows * width + columns).astype(np.intp), depth[inside])
+        np.minimum.at(nearest, (row[inside] * width + column[inside]).astype(np.intp), depth[inside])
         return MeasuredDepth(target, _filled(nearest.reshape(height, width)), self.noise)
 
-    def _seen_pixels(self, target: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Pixels (2, H, W) of a pinhole at the photograph's place that show the depths, rounded, and depths there.
+    def _seen_pixels(self, target: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Columns and rows (H, W) of a pinhole at the photograph's place that show the depths, and depths there.
 
         A depth d at the homogeneous pixel p has its place in the other image at d M p + b. In single precision, whose
         pixels are exact to a thousandth, all takes a third of the time.
@@ -113,7 +116,7 @@ class MeasuredDepth:
             column, row = undistort_pixels(pixels, self.camera).T.reshape(2, height, width).astype(np.float32)
         x, y, z = (self.depth * (m[i, 0] * column + (m[i, 1] * row + m[i, 2])) + b[i] for i in range(3))
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.rint(np.stack([x, y]) / z), z
+            return np.rint(x / z), np.rint(y / z), z
 
     def points(self) -> Array:
         """The points (P, 3) of the pixels with a depth, in the frame of the depth camera."""

@@ -23,7 +23,7 @@ MAX_EPIPOLAR_PX, MAX_RELATIVE_SIGMA = 2.0, 0.2
 POSE_SIGMA_M = 0.003
 """Standard deviation of the distance between two references, metres: a triangulated depth is off by as large a share.
 `research.depth_mistakes` prints the factors of right depths by it."""
-MOST_POINTS, GRID = 200, 1200
+MOST_POINTS, GRID = 150, 1200
 """Triangulated points of a neighbour that are compared, at most, and depths of all neighbours together: more take
 longer, and are not independent."""
 
