@@ -25,7 +25,7 @@ class Situation:
         any_roll: index of the features that match however the camera is rolled; None if there are none.
         angles_deg: by how much to turn the photograph, clockwise, so that references are upright in one of its rasters;
             empty if they are in the photograph as it is, or if that is unknown.
-        has_depth: whether a sensor has measured depth with the photograph.
+        has_depth: whether the photograph, or one of the references, has depth.
         known, promise: what is known of the photograph, and when an attempt is worth its time by that.
     """
 
@@ -100,9 +100,9 @@ RUNGS = (
         "depth",
         "the pose is found from matches with depths of the photograph, or of references",
         Doubt.STARVED | Doubt.CHANCE | Doubt.WIDE_RADIUS | Doubt.REFERENCES,
-        "a photograph with depth",
+        "depth of the photograph or of references",
         "a pose from depths",
-        "from its depth",
+        "from depths",
         lambda before, it: before.but(solver=Solver.DEPTHS),
         lambda before, it: it.is_best and it.has_depth and before.solver is Solver.POINTS,
         is_cheap=True,

@@ -56,7 +56,7 @@ def attempts(coarse: Coarse, doubt: DoubtOptions) -> Iterator[tuple[Found, Verdi
     situation = ladder.Situation(
         is_best=prepared.options.variant is Variant.BEST,
         reference_count=len(prepared.references),
-        has_depth=prepared.query.depths is not None,
+        has_depth=prepared.has_depth,
     )
     while True:
         found.append(solve(coarse, attempt, doubt))

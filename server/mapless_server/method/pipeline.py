@@ -126,6 +126,11 @@ class Prepared:
         return "m" if self.is_metric else "units"
 
     @property
+    def has_depth(self) -> bool:
+        """Whether the query, or a reference, has depth."""
+        return self.query.depths is not None or any(it.depths is not None for it in self.references)
+
+    @property
     def structure_options(self) -> StructureOptions:
         """Options of the structure stage for this variant."""
         return self.pipeline.options.structure(self.options.variant)

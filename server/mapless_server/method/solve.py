@@ -13,7 +13,7 @@ from mapless.geometry import RigidTransform
 from .bundle.adjust import adjust_pose, with_covariance
 from .bundle.estimate import PosedSupport, Support, with_halves
 from .bundle.pose_problem import AdjustInput
-from .features.views import Matches, PosedView, Reconstruction
+from .features.views import DepthSource, Matches, PosedView, Reconstruction
 from .judge.answer import Answer, Localization
 from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
@@ -142,8 +142,12 @@ def _from_one_reference(coarse: Coarse, scale: MetricScale) -> Answer:
 
 def _from_depths(coarse: Coarse) -> Answer:
     """Estimates the pose from matches whose keypoints have depths in the photograph, or in references."""
-    pairs = zip(coarse.prepared.references, coarse.prepared.correspondences.query_matches, strict=True)
-    return _by_depths(coarse, [_stored_depths(*it) for it in pairs], None, ScaleSource.DEPTH)
+    prepared = coarse.prepared
+    pairs = zip(prepared.references, prepared.correspondences.query_matches, strict=True)
+    depths = [prepared.query.depths, *(it.depths for it in prepared.references)]
+    is_measured = any(it is not None and it.source is DepthSource.MEASURED for it in depths)
+    source = ScaleSource.DEPTH if is_measured else ScaleSource.NETWORK
+    return _by_depths(coarse, [_stored_depths(*it) for it in pairs], None, source)
 
 
 def _by_depths(
@@ -171,6 +175,11 @@ def _by_depths(
         failure = failure or one_reference_radius_failure(found)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
+    if len(prepared.references) > 1:
+        with prepared.context.stage("judge"):
+            rejection = contradiction(support, votes_of(support), prepared.unit, estimate.covariance)
+        if rejection:
+            return coarse.answer(rejection, support)
     return coarse.answer(replace(Localization.of(estimate, trust), scale_source=source), support)
 
 

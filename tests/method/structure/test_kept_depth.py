@@ -13,10 +13,11 @@ from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.features.tracks import Tracks
 from mapless_server.method.features.views import DepthSource, Features, KeptDepth, KeypointDepths, PosedView
 from mapless_server.method.judge.answer import Localization
-from mapless_server.method.localize import localize
-from mapless_server.method.options import LocalizeOptions, Variant
+from mapless_server.method.judge.hypothesis import Solver
+from mapless_server.method.localize import attempts, localize
+from mapless_server.method.options import DoubtOptions, LocalizeOptions, StageContext, Variant
 from mapless_server.method.pairs.correspond import Correspondences, Matcher
-from mapless_server.method.pipeline import Pipeline
+from mapless_server.method.pipeline import Coarse, Pipeline, Prepared, prepare, reconstruct
 from mapless_server.method.structure.kept_depth import REGIONS, with_kept_depths
 from mapless_server.method.structure.model import ScaleSource, Structure
 from mapless_server.method.structure.structure import StructureOptions, triangulated_structure
@@ -276,6 +277,34 @@ def test_references_that_share_nothing_give_points_by_depth() -> None:
     assert isinstance(support, PosedSupport)
     assert support.two_view is None
     assert np.linalg.norm(outcome.world_from_camera.translation - SCENE.world_from_query.translation) < 0.02
+
+
+def test_rough_depths_of_several_references_serve_together() -> None:
+    """References that share no point, 3 m away with depths wrong by a fifth: the rung from depths is nearer."""
+    options = SceneOptions(150, reference_count=3, distance_m=3.0, query_offset_m=(1.5, -0.15, 0.3))
+    errors = []
+    for seed in range(3):
+        scene = make_scene(random_for("rung", seed), options)
+        given = list[PosedView]()
+        for i, (reference, seen) in enumerate(zip(scene.references, scene.reference_points, strict=True)):
+            kept = np.flatnonzero((seen % 3 == i) & (seen >= 0))
+            depth = reference.world_from_camera.inverse().apply(scene.x_in_world[seen[kept]])[:, 2]
+            depth *= np.exp(np.random.default_rng(seed).normal(0, 0.2, len(depth)))
+            features = reference.view.features
+            arrays = features.keypoints[kept], features.descriptors[kept], features.sizes_px[kept]
+            depths = replace(keypoint_depths(depth, 0.2), common_sigma=0.02, source=DepthSource.MEASURED)
+            given.append(replace(reference, view=replace(reference.view, features=Features(*arrays)), depths=depths))
+        prepared = prepare(scene.query, given, Pipeline(), LocalizeOptions(), StageContext())
+        assert isinstance(prepared, Prepared)
+        (coarse,) = reconstruct([prepared])
+        assert isinstance(coarse, Coarse)
+        found = {it.attempt.solver: it for it, _ in attempts(coarse, DoubtOptions(radius_m=0.01))}
+        outcomes = [found[solver].answer.outcome for solver in (Solver.POINTS, Solver.DEPTHS)]
+        centres = [it.world_from_camera.translation for it in outcomes if isinstance(it, Localization)]
+        errors.append(np.linalg.norm(np.array(centres) - scene.world_from_query.translation, axis=1))
+    points, depths_alone = np.array(errors).T
+    assert (depths_alone < 0.05).all()
+    assert np.median(depths_alone) < np.median(points)
 
 
 @pytest.mark.parametrize("variant", [Variant.COARSE, Variant.NO_STRUCTURE, Variant.FULL])

@@ -202,7 +202,10 @@ def _problem_of(
     query_matches: Sequence[Matches],
     depths: Sequence[MatchedDepths],
 ) -> tuple[_Problem, NDArray[np.intp], Matches]:
-    """The problem of the matches with a depth, with the index (M,) of each one's reference, and the matches (M, 2)."""
+    """The problem of the matches with a depth, with the index (M,) of each one's reference, and the matches (M, 2).
+
+    A keypoint has one point at most by depths of references, the first one's.
+    """
     view = np.repeat(np.arange(len(references)), [len(it) for it in query_matches])
     matches = np.concatenate(query_matches)
     points = np.concatenate([_points(*it) for it in zip(references, depths, query_matches, strict=True)])
@@ -210,12 +213,14 @@ def _problem_of(
     stated = [it.sigma for it in depths if it.sigma is not None]
     sigma = float(np.median(stated)) if len(stated) > 1 else next(iter(stated), None)
     centres = np.array([it.world_from_camera.translation for it in references])
+    own = np.zeros_like(known)
+    if query.depths is not None:
+        own = ~known & np.isfinite(query.depths.depth[matches[:, 0]])
+    at = np.flatnonzero(known)
+    known[np.delete(at, np.unique(matches[at, 0], return_index=True)[1])] = False
     seen = PixelPoints(query.camera, points[known], query.features.pixels(matches[known, 0]))
     problem = _Problem(seen, centres[view[known]], sigma)
-    if query.depths is None:
-        return problem, view[known], matches[known]
-    own = ~known & np.isfinite(query.depths.depth[matches[:, 0]])
-    if not own.any():
+    if query.depths is None or not own.any():
         return problem, view[known], matches[known]
     problem = replace(problem, turned=TurnedMatches.of(query, query.depths, references, view[own], matches[own]))
     if problem.turned is not None and problem.depth_sigma is None:
