@@ -170,6 +170,7 @@ POINT_SOURCES = {
     "MEASURED_DEPTH": "by measured depth",
     "KEPT_DEPTH": "by kept depth",
     "NETWORK_DEPTH": "by a network's depth",
+    "PHOTOGRAPH_DEPTH": "by the photograph's own depth",
 }
 """Words for the sources of points; see `Debug.source`."""
 

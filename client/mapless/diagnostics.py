@@ -182,7 +182,7 @@ class Debug:
         reference: (M,) index into `Diagnostics.references` of a reference that shows the point.
         reference_px: (M, 2) the point's pixel in that reference.
         source: (M,) what gives the point its distance, the value of PointSource without its prefix: "TRIANGULATED",
-            "MEASURED_DEPTH", "KEPT_DEPTH" or "NETWORK_DEPTH"; (0,) from servers older than 0.4.
+            "MEASURED_DEPTH", "KEPT_DEPTH", "NETWORK_DEPTH" or "PHOTOGRAPH_DEPTH"; (0,) from servers older than 0.4.
     """
 
     query_px: Array

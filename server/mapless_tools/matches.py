@@ -30,6 +30,7 @@ SOURCE_COLOURS = {
     "MEASURED_DEPTH": ("blue", "#4aa8ff"),
     "KEPT_DEPTH": ("yellow", "#ffd23f"),
     "NETWORK_DEPTH": ("white", "#f4f4f4"),
+    "PHOTOGRAPH_DEPTH": ("violet", "#b58cff"),
 }
 """Names and colours of matches that agree with a pose, by the sources of their points; see `Debug.source`."""
 RESIDUAL = "#ff4df0"

@@ -137,50 +137,69 @@ def test_where_there_are_too_many_the_inliers_stay() -> None:
     assert debug.ByteSize() < 130_000
 
 
+def with_depths(support: Support, sources: list[DepthSource]) -> Support:
+    """The references with depths of these sources, the last of which all others have."""
+    given = [*sources, *sources[-1:] * len(support.references)]
+    one = np.ones(1, np.float32)
+    references = tuple(
+        replace(it, depths=KeypointDepths(one, one, 0.02, source))
+        for it, source in zip(support.references, given, strict=False)
+    )
+    return replace(support, references=references)
+
+
+def seen_alone(support: Support, alone: np.ndarray, planes: DepthPlanes | None) -> Support:
+    """The mask (P,) says which points only their first reference observes."""
+    tracks = support.structure.tracks
+    kept = ~alone[tracks.point]
+    kept[tracks.starts] = True
+    few = Tracks(tracks.point[kept], tracks.view[kept], tracks.keypoint[kept])
+    return replace(support, structure=replace(support.structure, tracks=few, planes=planes))
+
+
 def test_a_point_has_the_source_of_its_distance() -> None:
     """Every second point is seen by its first reference alone, with a depth: measured of the first, kept of others."""
     scene = make_scene(random_for("debug sources"))
-    support = support_of(scene, SENT, scene.world_from_query)
-    tracks, count = support.structure.tracks, len(support.structure.x_in_world)
-    first = tracks.starts[1::2]
-    alone = np.zeros(count, bool)
-    alone[1::2] = True
-    kept = ~alone[tracks.point]
-    kept[first] = True
-    views = tracks.view[tracks.starts]
-    few = Tracks(tracks.point[kept], tracks.view[kept], tracks.keypoint[kept])
-    nothing = DepthPlanes.unknown(count)
-    planes = replace(nothing, information=np.ones(count), view=views)
-    references = tuple(
-        replace(it, depths=KeypointDepths(np.ones(1, np.float32), np.ones(1, np.float32), 0.02, source))
-        for it, source in zip(support.references, [DepthSource.MEASURED, *[DepthSource.NETWORK] * 99], strict=False)
-    )
-    debug = debug_to_message(
-        replace(support, structure=replace(support.structure, tracks=few, planes=planes), references=references)
-    )
-    point = support.matches.point
+    support = with_depths(support_of(scene, SENT, scene.world_from_query), [DepthSource.MEASURED, DepthSource.NETWORK])
+    count, views = len(support.structure.x_in_world), support.structure.tracks.view[support.structure.tracks.starts]
+    alone = np.arange(count) % 2 == 1
+    planes = replace(DepthPlanes.unknown(count), information=np.ones(count), view=views)
+    debug = debug_to_message(seen_alone(support, alone, planes))
     expected = np.where(views == 0, pb.POINT_SOURCE_MEASURED_DEPTH, pb.POINT_SOURCE_KEPT_DEPTH)
-    np.testing.assert_array_equal(debug.source, np.where(alone, expected, pb.POINT_SOURCE_TRIANGULATED)[point])
+    expected = np.where(alone, expected, pb.POINT_SOURCE_TRIANGULATED)
+    np.testing.assert_array_equal(debug.source, expected[support.matches.point])
     assert len(set(debug.source)) == 3
 
 
 @pytest.mark.parametrize(
-    ("stage", "is_measured", "source"),
+    ("stage", "kept", "source"),
     [
-        (ScaleStage.DEPTH, True, pb.POINT_SOURCE_MEASURED_DEPTH),
-        (ScaleStage.DEPTH, False, pb.POINT_SOURCE_KEPT_DEPTH),
-        (ScaleStage.NETWORK, False, pb.POINT_SOURCE_NETWORK_DEPTH),
+        (ScaleStage.DEPTH, DepthSource.MEASURED, pb.POINT_SOURCE_MEASURED_DEPTH),
+        (ScaleStage.DEPTH, DepthSource.NETWORK, pb.POINT_SOURCE_KEPT_DEPTH),
+        (ScaleStage.NETWORK, DepthSource.NETWORK, pb.POINT_SOURCE_NETWORK_DEPTH),
     ],
 )
-def test_points_of_one_reference_have_the_source_of_its_scale(
-    stage: ScaleStage, is_measured: bool, source: int
-) -> None:
+def test_points_by_depth_alone_have_its_source(stage: ScaleStage, kept: DepthSource, source: int) -> None:
     scene = make_scene(random_for("debug one reference"))
-    scale = MetricScale(
-        1.0, stage, 0.0, 0, Similarity(1.0, np.eye(3), np.zeros(3)), scene.world_from_query, 0.05, is_measured
-    )
-    debug = debug_to_message(support_of(scene, SENT, scene.world_from_query), scale)
-    assert set(debug.source) == {source}
+    nothing = Similarity(1.0, np.eye(3), np.zeros(3))
+    scale = MetricScale(1.0, stage, 0.0, 0, nothing, scene.world_from_query, 0.05)
+    support = with_depths(support_of(scene, SENT, scene.world_from_query), [kept])
+    alone = seen_alone(support, np.ones(len(support.structure.x_in_world), bool), None)
+    assert set(debug_to_message(alone, scale).source) == {source}
+
+
+def test_points_at_the_photographs_own_depth_have_another_source() -> None:
+    """Those of a reference's depth are near a plane."""
+    scene = make_scene(random_for("debug own depth"))
+    support = with_depths(support_of(scene, SENT, scene.world_from_query), [DepthSource.MEASURED])
+    count = len(support.structure.x_in_world)
+    has_plane = np.arange(count) % 2 == 1
+    planes = replace(DepthPlanes.unknown(count), information=has_plane.astype(float))
+    one = np.ones(1, np.float32)
+    query = replace(support.query, depths=KeypointDepths(one, one, 0.02, DepthSource.MEASURED))
+    debug = debug_to_message(replace(seen_alone(support, np.ones(count, bool), planes), query=query))
+    expected = np.where(has_plane, pb.POINT_SOURCE_MEASURED_DEPTH, pb.POINT_SOURCE_PHOTOGRAPH_DEPTH)
+    np.testing.assert_array_equal(debug.source, expected[support.matches.point])
 
 
 def test_no_matches_make_an_empty_message() -> None:

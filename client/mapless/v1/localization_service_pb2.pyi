@@ -129,6 +129,7 @@ class PointSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     POINT_SOURCE_MEASURED_DEPTH: _ClassVar[PointSource]
     POINT_SOURCE_KEPT_DEPTH: _ClassVar[PointSource]
     POINT_SOURCE_NETWORK_DEPTH: _ClassVar[PointSource]
+    POINT_SOURCE_PHOTOGRAPH_DEPTH: _ClassVar[PointSource]
 AXES_UNSPECIFIED: Axes
 AXES_OPENCV: Axes
 AXES_ARKIT: Axes
@@ -208,6 +209,7 @@ POINT_SOURCE_TRIANGULATED: PointSource
 POINT_SOURCE_MEASURED_DEPTH: PointSource
 POINT_SOURCE_KEPT_DEPTH: PointSource
 POINT_SOURCE_NETWORK_DEPTH: PointSource
+POINT_SOURCE_PHOTOGRAPH_DEPTH: PointSource
 
 class LocalizeRequest(_message.Message):
     __slots__ = ("scene", "references", "image", "intrinsics", "position_prior", "options", "capture_time", "session_from_camera", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "intrinsics_uncertainty", "mask", "depth")

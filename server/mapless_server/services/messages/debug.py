@@ -68,21 +68,28 @@ def _thinned(rows: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 def _sources(support: Support, scale: MetricScale | None) -> NDArray[np.int32]:
     """The source (P,) of each point of the structure, of `pb.PointSource`."""
-    structure = support.structure
-    sources = np.full(len(structure.x_in_world), pb.POINT_SOURCE_TRIANGULATED, np.int32)
-    if scale is not None and scale.is_from_depth:
-        predicted = pb.POINT_SOURCE_KEPT_DEPTH if scale.stage is ScaleStage.DEPTH else pb.POINT_SOURCE_NETWORK_DEPTH
-        sources[:] = pb.POINT_SOURCE_MEASURED_DEPTH if scale.is_measured else predicted
-    elif (planes := structure.planes) is not None:
-        is_measured = np.array([_is_measured(it) for it in support.references])
-        by_depth = ~structure.triangulated & (planes.information > 0)
-        of_plane = np.where(is_measured[planes.view], pb.POINT_SOURCE_MEASURED_DEPTH, pb.POINT_SOURCE_KEPT_DEPTH)
-        sources[by_depth] = of_plane[by_depth]
+    structure, count = support.structure, len(support.structure.x_in_world)
+    sources = np.full(count, pb.POINT_SOURCE_TRIANGULATED, np.int32)
+    is_single = np.bincount(structure.tracks.point, minlength=count) == 1
+    of_reference = np.array([_source_of(it, scale) for it in support.references], np.int32)
+    of_reference = of_reference[structure.tracks.view[structure.tracks.starts]]
+    is_all_by_depth = bool(is_single.all())  # as `solve_by_depths` has it
+    has_plane = is_all_by_depth if structure.planes is None else structure.planes.information > 0
+    by_reference = is_single & has_plane
+    sources[by_reference] = of_reference[by_reference]
+    if is_all_by_depth and support.query.depths is not None:
+        sources[~by_reference] = pb.POINT_SOURCE_PHOTOGRAPH_DEPTH
     return sources
 
 
-def _is_measured(reference: PosedView) -> bool:
-    return reference.depths is not None and reference.depths.source is DepthSource.MEASURED
+def _source_of(reference: PosedView, scale: MetricScale | None) -> int:
+    """The source of the points at a reference's depths."""
+    if scale is not None and scale.stage is ScaleStage.NETWORK:
+        return pb.POINT_SOURCE_NETWORK_DEPTH
+    if reference.depths is None:
+        return pb.POINT_SOURCE_TRIANGULATED
+    is_measured = reference.depths.source is DepthSource.MEASURED
+    return pb.POINT_SOURCE_MEASURED_DEPTH if is_measured else pb.POINT_SOURCE_KEPT_DEPTH
 
 
 def _best_observations(support: Support, points: NDArray[np.intp]) -> tuple[NDArray[np.intp], Array]:
