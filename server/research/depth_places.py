@@ -88,6 +88,7 @@ class Outcome:
         reason: of a rejection; empty for an answer.
         rung: the attempt that gave it, or the last one.
         processor_s: of all attempts.
+        photo_has_depth: whether the photograph has its depth.
     """
 
     place: str
@@ -103,6 +104,7 @@ class Outcome:
     reason: str
     rung: str
     processor_s: float
+    photo_has_depth: bool = False
 
     @property
     def is_localized(self) -> bool:
@@ -130,15 +132,16 @@ def main() -> None:
     found = list[Outcome]()
     for folder in arguments.folders:
         others = [it for it in arguments.folders if it != folder]
-        with closing(_Place(folder, arguments.features, arguments.cache)) as place:
+        with closing(DepthPlace(folder, arguments.features, arguments.cache)) as place:
             for outcome in place.outcomes(arguments.pairs, arguments.queries, arguments.counts):
-                found.append(_written(outcome, arguments.json))
+                found.append(written(outcome, arguments.json))
             for outcome in place.elsewhere(others, arguments.elsewhere):
-                found.append(_written(outcome, arguments.json))
+                found.append(written(outcome, arguments.json))
     print(*alone_rows(found), "", *several_rows(found), sep="\n")
 
 
-def _written(outcome: Outcome, file: Path | None) -> Outcome:
+def written(outcome: Outcome, file: Path | None) -> Outcome:
+    """The outcome, which is appended to a file, if there is one."""
     if file is not None:
         with file.open("a") as opened:
             opened.write(json.dumps(asdict(outcome)) + "\n")
@@ -157,11 +160,11 @@ def alone_rows(found: Sequence[Outcome]) -> Iterator[str]:
         away = [it for it in found if it.kind == "elsewhere" and it.place in some]
         cells = [
             name,
-            _ratio(len(right), len(its)),
+            ratio(len(right), len(its)),
             str(sum(it.share > WRONG_SHARE for it in right)),
             f"{100 * np.median([it.share for it in right]):.2f} %",
-            _ratio(sum((it.of_68 or 0) <= 1 for it in right), len(right)),
-            _ratio(sum((it.of_95 or 0) <= 1 for it in right), len(right)),
+            ratio(sum((it.of_68 or 0) <= 1 for it in right), len(right)),
+            ratio(sum((it.of_95 or 0) <= 1 for it in right), len(right)),
             f"{sum(it.is_localized for it in away)} of {len(away)}",
         ]
         yield f"| {' | '.join(cells)} |"
@@ -200,7 +203,8 @@ def _change(before: Sequence[float], after: Sequence[float]) -> str:
     return f"{np.exp(ratios.mean()):.2f} ({low:.2f} to {high:.2f})"
 
 
-def _ratio(count: int, total: int) -> str:
+def ratio(count: int, total: int) -> str:
+    """A share with its interval of 95 %."""
     low, high = 100 * betaincinv(count + 0.5, total - count + 0.5, [0.025, 0.975])  # Jeffreys
     return f"{count} of {total} ({low:.0f} to {high:.0f} %)"
 
@@ -240,11 +244,17 @@ class DepthFrames:
         return float((~(x[inside, 2] > (1 + HIDDEN_SHARE) * there)).sum() / len(x))
 
 
-class _Place:
-    """A folder whose frames are all stored, with their depth in one scene and without in another."""
+class DepthPlace:
+    """A folder whose frames are all stored, with their depth in one scene and without in another.
+
+    Attributes:
+        name: the folder's.
+        frames: with the kind of their sensor.
+        depths: which of them see the same.
+    """
 
     def __init__(self, folder: Path, features: str, cache: Path) -> None:
-        self._name, self._frames = folder.name, [known(it, folder.name) for it in read_folder(folder).frames]
+        self.name, self.frames = folder.name, [known(it, folder.name) for it in read_folder(folder).frames]
         self._data = tempfile.TemporaryDirectory()
         self._loop = asyncio.new_event_loop()
         self._store = Store.open(Path(self._data.name))
@@ -252,7 +262,7 @@ class _Place:
         tiers = [with_cache(it, cache) for it in make_tiers(settings)]
         self._engine: QueueEngine = engine_over(self._store, tiers, EngineOptions(workers=1))
         self._loop.run_until_complete(self._add())
-        self._depths = DepthFrames(self._frames)
+        self.depths = DepthFrames(self.frames)
 
     def close(self) -> None:
         """Ends the engine and deletes the store."""
@@ -263,25 +273,25 @@ class _Place:
 
     def outcomes(self, pairs: int, queries: int, counts: Sequence[int]) -> Iterator[Outcome]:
         """Those of one reference, and of several."""
-        for i, j in self._depths.pairs(pairs):
-            yield self._outcome("one", [i], self._frames[j], has_depth=True)
+        for i, j in self.depths.pairs(pairs):
+            yield self.outcome("one", [i], self.frames[j], has_depth=True)
         for count in counts:
-            few = np.unique(np.linspace(0, len(self._frames) - 1, count).round().astype(int)).tolist()
-            others = [it for it in range(len(self._frames)) if it not in few]
+            few = np.unique(np.linspace(0, len(self.frames) - 1, count).round().astype(int)).tolist()
+            others = [it for it in range(len(self.frames)) if it not in few]
             for j in np.unique(np.linspace(0, len(others) - 1, queries).astype(int)):
                 for has_depth in (False, True):
-                    yield self._outcome("several", few, self._frames[others[j]], has_depth)
+                    yield self.outcome("several", few, self.frames[others[j]], has_depth)
 
     def elsewhere(self, others: Sequence[Path], count: int) -> Iterator[Outcome]:
         """Photographs of other folders, each by one reference."""
         for number in range(count if others else 0):
             frames = read_folder(others[number % len(others)]).frames
-            i, j = (7 * number) % len(self._frames), (5 * number) % len(frames)
-            if self._frames[i].depth:
-                yield self._outcome("elsewhere", [i], frames[j], has_depth=True)
+            i, j = (7 * number) % len(self.frames), (5 * number) % len(frames)
+            if self.frames[i].depth:
+                yield self.outcome("elsewhere", [i], frames[j], has_depth=True)
 
     async def _add(self) -> None:
-        photos = [Photo(it.image_path.read_bytes(), it.camera, "image") for it in self._frames]
+        photos = [Photo(it.image_path.read_bytes(), it.camera, "image") for it in self.frames]
         described = await self._engine.describe(photos, _caller())
         for scene in (WITH, WITHOUT):
             self._store.create_scene(scene)
@@ -297,30 +307,45 @@ class _Place:
                         it.descriptors,
                         depth=frame.read_depth() if scene is WITH else None,
                     )
-                    for i, (frame, photo, it) in enumerate(zip(self._frames, photos, described, strict=True))
+                    for i, (frame, photo, it) in enumerate(zip(self.frames, photos, described, strict=True))
                 ],
             )
 
-    def _outcome(self, kind: str, references: Sequence[int], frame: Frame, has_depth: bool) -> Outcome:
+    def outcome(
+        self, kind: str, references: Sequence[int], frame: Frame, has_depth: bool, *, photo_has_depth: bool = False
+    ) -> Outcome:
+        """That of a photograph, with its own depth or without, by references."""
         photo = Photo(frame.image_path.read_bytes(), frame.camera, "image")
+        if photo_has_depth:
+            photo = replace(photo, depth=frame.read_depth())
         ids = tuple(f"r{i}" for i in references)
         query = Query(WITH if has_depth else WITHOUT, ids, photo, ANYWHERE, 10, LocalizeOptions(), is_generic=True)
         result = self._loop.run_until_complete(self._engine.run(self._engine.query_job(query, _caller())))
-        outcome, median_m = result.answer.outcome, float(np.median([self._depths.median_m(i) for i in references]))
+        outcome, median_m = result.answer.outcome, float(np.median([self.depths.median_m(i) for i in references]))
         rung = next((it.rung for it in result.attempts if it.is_chosen), "")
         spent_s = sum(it.processor_s for it in result.attempts)
-        about = self._name, kind, len(references), has_depth, frame.name, median_m
+        about = self.name, kind, len(references), has_depth, frame.name, median_m
         if not isinstance(outcome, Localization):
-            return Outcome(*about, None, None, None, None, f"{outcome.reason.value}: {outcome.message}", rung, spent_s)
+            return Outcome(
+                *about,
+                None,
+                None,
+                None,
+                None,
+                f"{outcome.reason.value}: {outcome.message}",
+                rung,
+                spent_s,
+                photo_has_depth,
+            )
         error_m, error_deg = pose_error(frame.world_from_camera, outcome.world_from_camera)
         assert outcome.covariance is not None
         radii = accuracy_from_covariance(outcome.covariance)
         ratios = error_m / radii.position_68_m, error_m / radii.position_95_m
         if kind == "one":
-            centre = self._frames[references[0]].world_from_camera.translation
-            scaled = SCALES.get(self._name, 1.0) * (outcome.world_from_camera.translation - centre)
+            centre = self.frames[references[0]].world_from_camera.translation
+            scaled = SCALES.get(self.name, 1.0) * (outcome.world_from_camera.translation - centre)
             error_m = float(np.linalg.norm(centre + scaled - frame.world_from_camera.translation))
-        return Outcome(*about, error_m, error_deg, *ratios, "", rung, spent_s)
+        return Outcome(*about, error_m, error_deg, *ratios, "", rung, spent_s, photo_has_depth)
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,10 @@ from .judge.cameras import intrinsics_checks
 from .judge.evidence import votes_of
 from .judge.hypothesis import Attempt, Doubt, Found, Solver, doubt_of, found_by
 from .judge.judge import (
-    MAX_GUESSED_RADIUS_SHARE,
     contradiction,
     judge,
     one_reference_failure,
     one_reference_radius_failure,
-    too_uncertain,
-    trust_of_own_depth,
     trust_of_score,
 )
 from .judge.references import unmoved_failure
@@ -164,15 +161,11 @@ def _by_depths(
     checks = prepared.priors.check(estimate.world_from_camera, estimate.covariance)
     estimate = replace(estimate, prior_checks=tuple(replace(it, used=False) for it in checks))
     support = replace(found.support, estimate=estimate)
-    trust = trust_of_score(found.score)
     if prepared.query.depths is not None:
         support = improved(support)
-        estimate, trust = support.estimate, trust_of_own_depth(support, found.score)
-        if rejection := too_uncertain(support, MAX_GUESSED_RADIUS_SHARE):
-            return coarse.answer(rejection, support)
-    failure = one_reference_failure(found, trust, prepared.options.coverage)
-    if prepared.query.depths is None:
-        failure = failure or one_reference_radius_failure(found)
+    estimate = support.estimate
+    trust = trust_of_score(found.score - estimate.depth_log10_chance)
+    failure = one_reference_failure(found, trust, prepared.options.coverage) or one_reference_radius_failure(found)
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
     if len(prepared.references) > 1:

@@ -64,8 +64,8 @@ MAX_RADIUS_SHARE = 0.08
 larger one too many are wrong. Evidence: largest-radius."""
 
 MAX_GUESSED_RADIUS_SHARE = 0.04
-"""The same where the intrinsics are a guess, or where depths give the pose and some are the photograph's: most of the
-radius is then an error of the distance that no other evidence shows. Evidence: unknown-camera."""
+"""The same where the intrinsics are a guess: most of the radius is then an error of the distance that no other evidence
+shows. Evidence: unknown-camera."""
 
 LEVELS = (
     0.0, 0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0,
@@ -82,14 +82,6 @@ where they have the least evidence. Evidence: depth-scores."""
 MAX_ONE_REFERENCE_RADIUS_SHARE = 0.04
 """Largest 95 % radius of a position from one reference, without the error that all depths share, as a share of the
 distance: a few matches on a small or flat thing fit poses that are farther apart. Evidence: depth-radius."""
-
-
-OWN_DEPTH_SCORES = (
-    12.5, 12.5, 12.6, 14.9, 22.3, 38.8, 55.0, 67.3, 87.1, 99.8,
-    180.8, 278.8, 469.2, 772.6, 1197.7, 1828.2, 2159.6, 2449.6, 2912.2, 5604.4,
-)  # fmt: skip
-"""The same where the photograph has depth: of 773 answers to pairs of photographs of four places, by three kinds of
-sensors, each of which counts alike; half of the references have depth, too (`research.depth_scores`)."""
 
 
 @dataclass(frozen=True)
@@ -160,13 +152,13 @@ def contradiction(
     best = support.references[int(np.argmax(support.inliers_by_reference()))].name
     wrong = wrong_intrinsics(evidence, best) if evidence else None
     if wrong:
-        return (too_uncertain(support) if _is_guessed(support) else None) or wrong  # what is unknown is not accused
+        return (_too_uncertain(support) if _is_guessed(support) else None) or wrong  # what is unknown is not accused
     if wrong := wrong_camera(support, best):
         return wrong
     hypotheses = find_rival(support, votes)
     if hypotheses:
         return _ambiguous(hypotheses, unit)
-    rejection = too_uncertain(support)
+    rejection = _too_uncertain(support)
     return (
         rejection if rejection is None or is_doubted else replace(rejection, imprecise=_imprecise(support, covariance))
     )
@@ -186,11 +178,6 @@ def trust_in_scene(trust: float, quantiles: tuple[float, ...]) -> float:
 def trust_of_score(score: float) -> float:
     """Share of right answers from one reference whose score is at most as high."""
     return float(np.interp(score, ONE_REFERENCE_SCORES, LEVELS))
-
-
-def trust_of_own_depth(support: PosedSupport, score: float) -> float:
-    """The same of a photograph with depth, whose agreement with the pose counts."""
-    return float(np.interp(score - support.estimate.depth_log10_chance, OWN_DEPTH_SCORES, LEVELS))
 
 
 def low_trust(evidence: Evidence, trust: float, coverage: float) -> Rejection | None:
@@ -241,10 +228,10 @@ def format_evidence(evidence: Evidence) -> str:
     )
 
 
-def too_uncertain(support: PosedSupport, largest: float = MAX_RADIUS_SHARE) -> Rejection | None:
-    """Rejects a pose whose own radius, above a share of the distance, says that it may well be wrong."""
+def _too_uncertain(support: PosedSupport) -> Rejection | None:
+    """Rejects a pose whose own radius says that it may well be wrong."""
     share = accuracy_from_covariance(support.estimate.covariance).position_68_m / support.distance_m()
-    largest = min(MAX_GUESSED_RADIUS_SHARE, largest) if _is_guessed(support) else largest
+    largest = MAX_GUESSED_RADIUS_SHARE if _is_guessed(support) else MAX_RADIUS_SHARE
     if share <= largest:
         return None
     message = (

@@ -14,7 +14,8 @@ pose, whose usual size the covariance contains.
 
 A match whose reference has no depth is a point of the photograph's own depth, in the photograph's frame, that the
 reference sees: the same problem turned around. The factor that these depths share is an unknown with its prior, since
-several references, or depths of both sides, show it. It makes the scene's unit no other one: that is of the poses.
+several references, or depths of both sides, show it. The scene's unit remains that of the references' poses. A few
+matches that agree by chance would give the factor any value, so only references with enough inliers for a pose count.
 """
 
 from collections.abc import Sequence
@@ -133,6 +134,8 @@ def solve_by_depths(
     covariance = own = _covariance(problem, solved) + _reference_covariance(problem, solved, centre)
     if problem.turned is None or len(problem.turned) < len(view):
         covariance = own + scale_covariance(pose, centre, depths[nearest].common_sigma)
+    if problem.turned is not None:
+        covariance = covariance + _factor_covariance(problem, solved)
     estimate = PoseEstimate(pose, PoseStage.REFINED, solved.inliers, solved.errors_px, covariance)
     rows = np.arange(len(matches))
     structure = Structure(
@@ -159,19 +162,28 @@ class _Problem:
         seen: points at depths of the references that the query sees.
         reference_centre: (S, 3) centre of the reference of each.
         depth_sigma: the stated error of a depth, as a share; None if it is not stated.
+        view: (M,) index of the reference of each match.
         turned: points at depths of the query; None if there are none.
     """
 
     seen: PixelPoints
     reference_centre: Array
     depth_sigma: float | None
+    view: NDArray[np.intp]
     turned: TurnedMatches | None = None
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> "_Problem":
         count = len(self.seen)
         turned = None if self.turned is None else self.turned[rows[count:]]
         seen, centre = self.seen[rows[:count]], self.reference_centre[rows[:count]]
-        return replace(self, seen=seen, reference_centre=centre, turned=turned)
+        return replace(self, seen=seen, reference_centre=centre, view=self.view[rows], turned=turned)
+
+    def inliers(self, distance: Array) -> NDArray[np.bool_]:
+        """Mask (M,) of the inliers, by their distances in standard deviations."""
+        near = distance < INLIER_SIGMA
+        if self.turned is None:
+            return near
+        return np.asarray(near & (np.bincount(self.view, near)[self.view] >= MIN_INLIERS))
 
     def points(self, solved: "_Solved") -> Array:
         """The points (M, 3) in the world."""
@@ -219,13 +231,13 @@ def _problem_of(
     at = np.flatnonzero(known)
     known[np.delete(at, np.unique(matches[at, 0], return_index=True)[1])] = False
     seen = PixelPoints(query.camera, points[known], query.features.pixels(matches[known, 0]))
-    problem = _Problem(seen, centres[view[known]], sigma)
+    problem = _Problem(seen, centres[view[known]], sigma, view[known])
     if query.depths is None or not own.any():
         return problem, view[known], matches[known]
-    problem = replace(problem, turned=TurnedMatches.of(query, query.depths, references, view[own], matches[own]))
-    if problem.turned is not None and problem.depth_sigma is None:
-        problem = replace(problem, depth_sigma=problem.turned.depth_sigma)
-    return problem, np.concatenate([view[known], view[own]]), np.concatenate([matches[known], matches[own]])
+    turned = TurnedMatches.of(query, query.depths, references, view[own], matches[own])
+    sigma, view = turned.depth_sigma if sigma is None else sigma, np.concatenate([view[known], view[own]])
+    problem = replace(problem, depth_sigma=sigma, view=view, turned=turned)
+    return problem, view, np.concatenate([matches[known], matches[own]])
 
 
 def _points(reference: PosedView, depths: MatchedDepths, matches: Matches) -> Array:
@@ -307,6 +319,8 @@ def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
         rows = _linearize(problem, pose, log_factor)
         distance = _distances(rows, sigma_px, depth_sigma)
         information = rows.information(sigma_px, depth_sigma) * cauchy_weight(distance**2, 2.0)[:, None, None]
+        if problem.turned is not None:
+            information *= problem.inliers(distance)[:, None, None]
         hessian = np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose)
         gradient = np.einsum("mia,mij,mj->a", rows.by_pose, information, rows.residual)
         if problem.turned is not None:
@@ -317,11 +331,11 @@ def _refine(problem: _Problem, pose: RigidTransform) -> _Solved:
             break
         pose = perturbed(pose.inverse(), step[:6]).inverse()
         log_factor += float(step[6]) if problem.turned is not None else 0.0
-        inliers = distance < INLIER_SIGMA
+        inliers = problem.inliers(distance)
         if iteration >= 2 and inliers.sum() >= MIN_INLIERS:
             sigma_px, depth_sigma = _noise(_linearize(problem, pose, log_factor), inliers, problem.depth_sigma)
     distance = _distances(_linearize(problem, pose, log_factor), sigma_px, depth_sigma)
-    return _Solved(pose, distance < INLIER_SIGMA, distance * sigma_px, sigma_px, depth_sigma, log_factor)
+    return _Solved(pose, problem.inliers(distance), distance * sigma_px, sigma_px, depth_sigma, log_factor)
 
 
 def _noise(rows: Rows, inliers: NDArray[np.bool_], stated_sigma: float | None) -> tuple[float, float]:
@@ -344,21 +358,34 @@ def _noise(rows: Rows, inliers: NDArray[np.bool_], stated_sigma: float | None) -
 
 
 def _covariance(problem: _Problem, solved: _Solved) -> Array:
-    """Covariance (6, 6) in the world, with the part of the factor of the query's depths, without other scales."""
-    pose, shared = solved.world_from_camera, 1 + solved.inliers.sum() / SHARED_MATCHES
-    rows = _linearize(problem, pose, solved.log_factor)
-    information = rows.information(solved.sigma_px, solved.depth_sigma) * solved.inliers[:, None, None]
-    hessian = np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose)
-    covariance = world_covariance(hessian[:6, :6], pose)
-    covariance *= shared
+    """Covariance (6, 6) in the world, without the parts of the factors that depths share."""
+    covariance = world_covariance(_hessian(problem, solved)[:6, :6], solved.world_from_camera)
+    covariance *= _shared(solved)
     factor = np.repeat([1.0, ROTATION_FACTOR], 3)
-    covariance = np.asarray(factor[:, None] * covariance * factor)
+    return np.asarray(factor[:, None] * covariance * factor)
+
+
+def _shared(solved: _Solved) -> float:
+    """Factor on variances for what matches share."""
+    return float(1 + solved.inliers.sum() / SHARED_MATCHES)
+
+
+def _hessian(problem: _Problem, solved: _Solved) -> Array:
+    """The information (U, U) of the inliers."""
+    rows = _linearize(problem, solved.world_from_camera, solved.log_factor)
+    information = rows.information(solved.sigma_px, solved.depth_sigma) * solved.inliers[:, None, None]
+    return np.asarray(np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose))
+
+
+def _factor_covariance(problem: _Problem, solved: _Solved) -> Array:
+    """Part (6, 6) of the covariance in the world by the factor of the query's depths; 0 if none are used."""
     if problem.turned is None:
-        return covariance
+        return np.zeros((6, 6))
+    hessian = _hessian(problem, solved)
     motion = -np.linalg.pinv(hessian[:6, :6], hermitian=True) @ hessian[:6, 6]
-    of_factor = max(0.0, float(hessian[6, 6] + hessian[6, :6] @ motion)) / shared
-    moved = world_jacobian(pose) @ motion
-    return np.asarray(covariance + np.outer(moved, moved) / (of_factor + problem.turned.common_sigma**-2))
+    of_factor = max(0.0, float(hessian[6, 6] + hessian[6, :6] @ motion)) / _shared(solved)
+    moved = world_jacobian(solved.world_from_camera) @ motion
+    return np.asarray(np.outer(moved, moved) / (of_factor + problem.turned.common_sigma**-2))
 
 
 def _reference_covariance(problem: _Problem, solved: _Solved, reference_centre: Array) -> Array:
