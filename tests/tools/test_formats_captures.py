@@ -69,6 +69,18 @@ def test_depths_of_transforms_are_scaled_with_the_poses(tmp_path: Path) -> None:
     assert scaled.unit_m == 0.0005
 
 
+def test_depths_of_nerfcapture_have_their_own_unit(tmp_path: Path) -> None:
+    folder = write_transforms(tmp_path, integer_depth_scale=0.0005)
+    (folder / "depth.png").write_bytes(encode(".png", np.ones((64, 96), np.uint16)))
+    edit(folder / "transforms.json", lambda it: it["frames"][0].update(depth_path="depth.png"))
+    depth = read_dataset(folder).frames[0].depth
+    assert depth is not None
+    assert depth.unit_m == 0.0005
+    edit(folder / "transforms.json", lambda it: it.pop("integer_depth_scale"))
+    dataset = read_dataset(folder)
+    assert (dataset.frames[0].depth, "1 depths are left out" in dataset.notes[-1]) == (None, True)
+
+
 @pytest.mark.parametrize("path", ["none.png", "depth.npy", "colours.png", 5])
 def test_photographs_whose_depth_is_unusable_are_kept(tmp_path: Path, path: object) -> None:
     folder = write_transforms(tmp_path)

@@ -281,3 +281,35 @@ def test_frames_of_stray_scanner_are_joined_by_number(tmp_path: Path) -> None:
     shown = [np.asarray(cv2.imread(str(frame.image_path)), float) for frame in dataset.frames]
     off = [[np.abs(it[..., ::-1] - textured(seed=seed)).mean() for seed in range(3)] for it in shown]
     assert np.argmin(off, axis=1).tolist() == [0, 2]
+
+
+def test_a_depth_camera_too_far_from_the_photographs_is_left_out(tmp_path: Path) -> None:
+    """A server would refuse the reference: it is more than 1 m off."""
+    room = LAYOUTS["12scenes"](tmp_path)
+    far = np.eye(4)
+    far[0, 3] = 20.0
+    info = room / "info.txt"
+    kept = [line for line in info.read_text().splitlines() if "DepthExtrinsic" not in line]
+    info.write_text("\n".join([*kept, f"m_calibrationDepthExtrinsic = {' '.join(map(str, far.ravel()))}"]))
+    dataset = read_dataset(room)
+    assert [frame.depth for frame in dataset.frames] == [None, None]
+    assert any("millimetres" in note for note in dataset.notes)
+
+
+@pytest.mark.parametrize("path", ["../outside.png", "/etc/hostname", "depth", "a" * 300, "loop.png", "no\0name.png"])
+def test_paths_of_depth_that_lead_nowhere_are_left_out(tmp_path: Path, path: str) -> None:
+    folder = LAYOUTS["icl"](tmp_path / "set")
+    (tmp_path / "outside.png").write_bytes((folder / "depth" / "0.png").read_bytes())
+    (folder / "loop.png").symlink_to("loop.png")
+    file = folder / "associations.txt"
+    file.write_text(file.read_text().replace("0 depth/0.png 0 rgb/0.png", f"0 rgb/0.png 0 {path}"))
+    dataset = read_dataset(folder)
+    assert (len(dataset.frames), dataset.frames[0].depth, dataset.refused) == (2, None, ())
+
+
+def test_linked_depth_is_read_as_linked_photographs_are(tmp_path: Path) -> None:
+    folder = LAYOUTS["icl"](tmp_path / "set")
+    file = folder / "depth" / "0.png"
+    file.rename(tmp_path / "elsewhere.png")
+    file.symlink_to(tmp_path / "elsewhere.png")
+    assert_planted(read_dataset(folder).frames[0])

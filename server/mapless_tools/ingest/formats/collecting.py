@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from mapless.cameras import MAX_SIDE_PX
+from mapless.depth import depth_from_message, depth_to_message
 from mapless.geometry import MAX_COORDINATE_M, Array, Camera, Quaternion, RigidTransform
 from mapless.provenance import GIVEN_POSE, Provenance
 from mapless.text_files import numbered_lines
@@ -173,8 +174,10 @@ class Collector:
             return None
         try:
             confidence = depth.confidence_path and path_in(folder, str(depth.confidence_path))
-            found = replace(depth, path=path_in(folder, str(depth.path)), confidence_path=confidence)
-            decode_depth(found.read(), photo, ImageLimits())
+            whole = replace(depth, path=path_in(folder, str(depth.path)), confidence_path=confidence)
+            found = self.depths.of(whole) or whole
+            sent = depth_from_message(depth_to_message(found.read()), "depth")  # as a server checks it
+            decode_depth(sent, photo, ImageLimits())
         except UNUSABLE as error:
             self.leave_out_depth(str(depth.path), error)
             return None

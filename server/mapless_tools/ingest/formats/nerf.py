@@ -5,8 +5,9 @@ OpenGL's camera axes); in a frame or for all, `fl_x`, `fl_y`, `cx`, `cy`, `w`, `
 `camera_model`, `is_fisheye`, k1 to k4, p1 and p2; and for all `applied_transform` and `applied_scale`, which are
 undone, and `train_filenames`, `val_filenames`, `test_filenames`. A frame's `mask_path` is its mask: black pixels are
 ignored, as in nerfstudio. A frame's `depth_file_path` is its depth, of the same camera: a PNG of 16 bits in thousandths
-of the unit of the poses before `applied_scale`, nerfstudio's `depth_unit_scale_factor`. Other depth, such as .npy, is
-left out with a note.
+of the unit of the poses before `applied_scale`, nerfstudio's `depth_unit_scale_factor`; or its `depth_path` is, in
+`integer_depth_scale` of that unit, as instant-ngp's nerfcapture2nerf.py writes it. Other depth, such as .npy, is left
+out with a note.
 
 Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so principal points count from the corner.
 """
@@ -65,7 +66,7 @@ def _read_file(file: Path, split: str, collector: Collector) -> None:
             pose = _world_from_camera(frame, scale, transform)
             camera = _camera(collector, image, content | frame)
             its_split = splits.get(str(frame["file_path"]), split)
-            depth = _depth(collector, frame, camera)
+            depth = _depth(collector, content | frame, camera)
             collector.add(image, camera, pose, its_split, mask=frame.get("mask_path"), depth=depth)
 
 
@@ -77,10 +78,17 @@ def _image(collector: Collector, frame: Mapping[str, Any]) -> str:
 
 
 def _depth(collector: Collector, frame: Mapping[str, Any], camera: Camera) -> DepthFile | None:
-    path = frame.get("depth_file_path")
+    path, unit = frame.get("depth_file_path"), DEPTH_UNIT
+    if path is None and frame.get("depth_path") is not None:
+        path = frame["depth_path"]
+        try:
+            unit = _number(frame, "integer_depth_scale", 0.0)
+        except ValueError as error:
+            collector.leave_out_depth(str(path), error)
+            return None
     if path is None:
         return None
-    return collector.depth(DepthFile(Path(str(path)), DEPTH_UNIT), (camera.width_px, camera.height_px))
+    return collector.depth(DepthFile(Path(str(path)), unit), (camera.width_px, camera.height_px))
 
 
 def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:
