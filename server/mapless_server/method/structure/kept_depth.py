@@ -23,8 +23,9 @@ where depths do not differ. What is left of them moves the planes of all referen
 which the pose's covariance contains (see `bundle.dispersion`). Evidence: depth-errors.
 
 Neighbouring depths share errors, too, so n of them do not average out: they count as of `REGIONS` regions, each with an
-error of its own as large as the common one. The variance of each is larger by n / `REGIONS` of its square, so that
-hundreds of depths do not outweigh what is triangulated.
+error of its own as large as the common one. Those of a reference share the error of its pose as well, so they count as
+fewer, `PLACED_REGIONS`: the variance of each is larger by n / `PLACED_REGIONS` of its square. So hundreds of depths do
+not outweigh what is triangulated.
 """
 
 from collections.abc import Sequence
@@ -49,6 +50,9 @@ ITERATIONS = 6
 
 REGIONS = 20
 """Regions of an image whose depths have independent errors. Evidence: depth-errors."""
+
+PLACED_REGIONS = 5
+"""The same for points at the depths of a reference, whose errors of the pose they share. Evidence: depth-errors."""
 
 LARGEST_SIGMA = 0.1
 """Largest relative standard deviation of a triangulated depth that says something of common errors: with larger ones
@@ -132,7 +136,7 @@ class _KnownDepths:
         normal, view = self.axis[rows], self.views(rows)
         offset = (normal * self.centre[rows]).sum(axis=1) + self.depth[rows]
         count = np.bincount(view, minlength=len(self.offsets))[view]
-        variance = self.sigma[rows] ** 2 + (self.shared_sigma[rows] * self.depth[rows]) ** 2 * count / REGIONS
+        variance = self.sigma[rows] ** 2 + (self.shared_sigma[rows] * self.depth[rows]) ** 2 * count / PLACED_REGIONS
         return DepthPlanes(normal, offset, 1 / variance, view, self.common[rows] * self.depth[rows, None])
 
 
