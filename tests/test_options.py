@@ -20,7 +20,11 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
         ("max_side_px", 8),
         ("contrast_threshold", NAN),
     ],
-    "method.features.lightglue.LightGlueOptions": [("min_score", 1.0), ("max_keypoints", 0), ("pairs_at_once", 0)],
+    "method.features.lightglue_options.LightGlueOptions": [
+        ("min_score", 1.0),
+        ("max_keypoints", 0),
+        ("pairs_at_once", 0),
+    ],
     "method.structure.match.MatchOptions": [("radius_px", -1.0), ("min_similarity", 2.0), ("radius_px", NAN)],
     "method.options.IntrinsicsSigma": [("focal_share", 0.0), ("principal_share", -1.0), ("k1", NAN), ("k1", 2.0)],
     "method.pose.pnp.PnpOptions": [("inlier_px", 0.0), ("inlier_px", NAN), ("min_iterations", 10**6)],

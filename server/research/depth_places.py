@@ -45,7 +45,8 @@ from mapless_server.method.structure.measured_depth import MeasuredDepth
 from mapless_server.scenes import ANYWHERE
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
-from mapless_server.serve.assembly import engine_over, make_tiers
+from mapless_server.serve.assembly import engine_over
+from mapless_server.serve.features import make_tiers
 from mapless_server.settings import load_settings
 from mapless_server.store import NewReference, Store
 from mapless_tools.dataset import Frame

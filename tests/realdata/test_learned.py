@@ -15,7 +15,7 @@ from mapless_server.method.judge.hypothesis import doubts_of
 from mapless_server.method.ladder import STRENGTHENED
 from mapless_server.method.localize import localize
 from mapless_server.method.options import DoubtOptions, LocalizeOptions
-from mapless_server.serve.assembly import make_tiers
+from mapless_server.serve.features import make_tiers
 from mapless_server.settings import Settings
 from mapless_tools.dataset import Dataset
 

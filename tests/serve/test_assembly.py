@@ -11,16 +11,10 @@ from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsMissing
 from mapless_server.observability.metrics import Metrics
-from mapless_server.serve import assembly
-from mapless_server.serve.assembly import (
-    ANY_ROLL_PIXELS,
-    StartupError,
-    feature_names,
-    make_engine,
-    make_first_features,
-    make_tiers,
-)
+from mapless_server.serve import features
+from mapless_server.serve.assembly import StartupError, make_engine
 from mapless_server.serve.devices import choose_device
+from mapless_server.serve.features import ANY_ROLL_PIXELS, feature_names, make_first_features, make_tiers
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
@@ -67,8 +61,8 @@ def test_auto_leaves_out_what_is_missing_and_logs_it(
         return make_extractor(name)
 
     if missing == "package":
-        monkeypatch.setattr(assembly, "find_weights", lambda name, weights_dir: weights_dir / name)
-        monkeypatch.setattr(assembly, "make_extractor", without_package)
+        monkeypatch.setattr(features, "find_weights", lambda name, weights_dir: weights_dir / name)
+        monkeypatch.setattr(features, "make_extractor", without_package)
     with caplog.at_level(logging.INFO):
         (tier,) = make_tiers(settings(tmp_path, features="auto"))
     assert tier.extractor.name.startswith("sift")
@@ -106,7 +100,7 @@ def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> No
 
 def test_a_server_without_networks_does_not_load_torch(tmp_path: Path) -> None:
     program = """if True:
-        import sys; from pathlib import Path; from mapless_server.serve.assembly import ANY_ROLL_PIXELS, make_tiers
+        import sys; from pathlib import Path; from mapless_server.serve.features import ANY_ROLL_PIXELS, make_tiers
         from mapless_server.settings import Settings
         make_tiers(Settings(data_dir=Path(sys.argv[1]), weights_dir=Path(sys.argv[1])))
         print('torch' in sys.modules)
@@ -137,9 +131,9 @@ def test_light_glue_matches_alone_on_gpus_only(tmp_path: Path, monkeypatch: pyte
         looked_for.append(name)
         raise WeightsMissing(name, weights_dir)
 
-    monkeypatch.setattr(assembly, "find_weights", find)
+    monkeypatch.setattr(features, "find_weights", find)
     for device in ("cpu", "cuda"):
-        assembly._make_matcher("aliked", settings(tmp_path), device).close()
+        features._make_matcher("aliked", settings(tmp_path), device).close()
         assert looked_for == [] if device == "cpu" else ["aliked-lightglue"]
 
 
@@ -150,12 +144,12 @@ def test_a_stronger_tier_rematches_by_light_glue(tmp_path: Path) -> None:
     from mapless_server.networks.lightglue import LightGlue
 
     missing: dict[str, ImportError | WeightsMissing] = {}
-    without = make_matcher("aliked", 1, assembly._find_light_glue("aliked", settings(tmp_path), missing))
+    without = make_matcher("aliked", 1, features._find_light_glue("aliked", settings(tmp_path), missing))
     assert without.pair_matching is None
     assert list(missing) == ["aliked-lightglue"]
     (tmp_path / "weights").mkdir()
     save_file(LightGlue(128).state_dict(), tmp_path / "weights" / "aliked-lightglue.safetensors")
-    matcher = make_matcher("aliked", 1, assembly._find_light_glue("aliked", settings(tmp_path), missing := {}))
+    matcher = make_matcher("aliked", 1, features._find_light_glue("aliked", settings(tmp_path), missing := {}))
     assert not missing
     assert matcher.pair_matching is not None
     assert matcher.pairs.name(Matching.STRONG) not in {matcher.pairs.name(), without.pairs.name()}

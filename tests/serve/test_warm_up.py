@@ -44,7 +44,8 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import CostModel, Flow
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import MakeEngine, Parts, StartupError, engine_options, engine_over, make_tiers
+from mapless_server.serve.assembly import MakeEngine, Parts, StartupError, engine_options, engine_over
+from mapless_server.serve.features import make_tiers
 from mapless_server.serve.warm_up import ROUNDS, warm_up, warm_up_stronger
 from mapless_server.settings import Settings
 from mapless_server.store import Store

@@ -25,7 +25,8 @@ from mapless_server.method.features.views import PosedView, ReconstructedView, R
 from mapless_server.method.structure import kept_depth
 from mapless_server.observability.metrics import Metrics
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import Parts, engine_options, engine_over, make_tiers
+from mapless_server.serve.assembly import Parts, engine_options, engine_over
+from mapless_server.serve.features import make_tiers
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 from mapless_tools.demo import Photograph, depth_map_m, room

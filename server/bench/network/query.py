@@ -26,7 +26,7 @@ from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.runner import NetworkRunner
 from mapless_server.networks.weights import WeightsError
-from mapless_server.serve.assembly import make_tiers
+from mapless_server.serve.features import make_tiers
 from mapless_server.settings import load_settings
 from mapless_tools.demo import Photograph as Picture
 from mapless_tools.demo import depth_map_m, room

@@ -19,7 +19,7 @@ from mapless_server import __version__
 from mapless_server.networks.weights import CATALOGUE
 from mapless_server.networks.weights.folder import Status, look_up, recorded
 from mapless_server.observability.provenance import ROOT, commit_of, cpu_model
-from mapless_server.serve.assembly import device_for, feature_names
+from mapless_server.serve.features import device_for, feature_names
 from mapless_server.settings import Settings, available_cores
 from mapless_tools.child import ServerFailed, temporary_server
 from mapless_tools.dataset import Dataset, Frame

@@ -19,7 +19,7 @@ from mapless import Scene as KnownScene
 from mapless.provenance import PLACED, Provenance
 from mapless_server.choices import AUTO
 from mapless_server.method.bundle.priors import IntrinsicsSigma
-from mapless_server.serve.assembly import ANY_ROLL
+from mapless_server.serve.features import ANY_ROLL
 from mapless_server.settings import available_cores
 from mapless_tools.dataset import Dataset, Frame, legal_id
 from mapless_tools.ingest.existing import KnownReferences

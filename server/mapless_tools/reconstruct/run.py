@@ -20,7 +20,7 @@ from mapless_server import __version__
 from mapless_server.choices import AUTO, BEST_VARIANTS, FEATURES
 from mapless_server.method.features.matching import OPTIONS
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
-from mapless_server.serve.assembly import ANY_ROLL, make_first_features
+from mapless_server.serve.features import ANY_ROLL, make_first_features
 from mapless_server.settings import available_cores, load_settings
 from mapless_tools.progress import Progress, labelled
 

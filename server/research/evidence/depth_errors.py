@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.structure.structure import StructureOptions, observe, triangulated_structure
-from mapless_server.serve.assembly import make_tiers
+from mapless_server.serve.features import make_tiers
 from mapless_server.settings import load_settings
 from mapless_tools.ingest.formats.cameras import read_folder
 

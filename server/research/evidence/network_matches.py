@@ -13,7 +13,7 @@ from mapless_server.method.features.matching import OPTIONS
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.epipolar import sampson_px
-from mapless_server.serve.assembly import make_tiers
+from mapless_server.serve.features import make_tiers
 from mapless_server.settings import load_settings
 from mapless_tools.dataset import Frame
 from research.places import Scenes, own_and_other

@@ -21,7 +21,8 @@ from safetensors.torch import save_file  # noqa: E402
 from support.device import Watch  # noqa: E402
 from torch import Tensor  # noqa: E402
 
-from mapless_server.method.features.lightglue import LightGlueMatching, LightGlueOptions, Padded  # noqa: E402
+from mapless_server.method.features.lightglue import LightGlueMatching, Padded  # noqa: E402
+from mapless_server.method.features.lightglue_options import LightGlueOptions  # noqa: E402
 from mapless_server.networks.lightglue import (  # noqa: E402
     LightGlue,
     load_lightglue,

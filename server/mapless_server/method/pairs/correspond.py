@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,9 @@ from ..features.tracks import keypoint_offsets
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from .pair import Matching, PairKey, PairMatches, ReferencePairs, in_order
 from .stationary import IgnoredKeypoints, StationaryOptions, without_ignored
+
+if TYPE_CHECKING:
+    from ..features.lightglue import LightGlueMatching
 
 
 @dataclass(frozen=True, eq=False)
@@ -354,12 +358,17 @@ def make_matcher(
         raise ValueError(f"unknown features {features!r}; known: {', '.join(OPTIONS)}")
     if weights is None:
         return Matcher(OPTIONS[features], threads)
+    light_glue = make_light_glue(features, weights, device)
+    if device == "cpu":
+        return Matcher(OPTIONS[features], threads, pair_matching=light_glue)
+    return Matcher(OPTIONS[features], threads, light_glue)
+
+
+def make_light_glue(features: str, weights: Path, device: str = "cpu") -> "LightGlueMatching":
+    """Makes the LightGlue of an extractor; errors as in `make_matcher`."""
     from mapless_server.networks.lightglue import load_lightglue
 
     from ..features.lightglue import LightGlueMatching
 
     network, sha256 = load_lightglue(features, weights)
-    light_glue = LightGlueMatching(network, device, sha256=sha256)
-    if device == "cpu":
-        return Matcher(OPTIONS[features], threads, pair_matching=light_glue)
-    return Matcher(OPTIONS[features], threads, light_glue)
+    return LightGlueMatching(network, device, sha256=sha256)

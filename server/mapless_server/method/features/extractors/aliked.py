@@ -18,7 +18,7 @@ from ..limits import MULTIPLE_PX
 from ..masks import are_usable, usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
 from .network import array_of, image_tensor
-from .options import LearnedOptions
+from .options import ALIKED_VARIANT, LearnedOptions
 
 _CORNERS = torch.tensor([[0, 0], [1, 0], [0, 1], [1, 1]])
 """Pixels around a position, x and y, from the first."""
@@ -48,7 +48,7 @@ class AlikedExtractor:
         # Above the threshold, however many: with a mask the strongest are chosen after it.
         radius, threshold = self._network.nms_radius, max(self.options.min_score, 1e-9)
         self._all_maxima = DKD(radius, top_k=0, scores_th=threshold, n_limit=_UNLIMITED).to(self._device)
-        self.name = self.options.label("aliked-n16", sha256)
+        self.name = self.options.label(ALIKED_VARIANT, sha256)
 
     @torch.inference_mode()
     def extract(self, image: NDArray[np.uint8], camera: Camera, ignored: Ignored | None = None) -> View:

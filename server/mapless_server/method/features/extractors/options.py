@@ -6,6 +6,9 @@ from mapless_server.bounds import check_bounds
 
 from ..limits import MAX_KEYPOINTS, MAX_SIDE_PX, MULTIPLE_PX
 
+ALIKED_VARIANT = "aliked-n16"
+"""ALIKED's variant, in names of its features."""
+
 WINDOW_PX = 5
 """Side of the window in which a keypoint is the strongest pixel."""
 

@@ -1,0 +1,68 @@
+"""Networks that are made when they are needed first: once, by their name."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from time import sleep
+
+import numpy as np
+import pytest
+from support.scenes import CAMERA, make_scene, random_for
+
+from mapless.geometry import Camera
+from mapless_server.method.features.views import Features, Matches, View
+from mapless_server.serve.deferred import DeferredExtractor, DeferredPairMatching
+
+VIEW = View(CAMERA, Features(np.zeros((0, 2), np.float32), np.zeros((0, 64), np.float32), np.zeros(0, np.float32)))
+
+
+@dataclass
+class Finds:
+    name: str = "finds-1"
+
+    def extract(self, image: object, camera: Camera, ignored: object = None) -> View:
+        return VIEW
+
+
+@dataclass
+class Pairs:
+    name: str = "pairs-1"
+
+    def match_one(self, first: View, second: View, pause: Callable[[], None] = lambda: None) -> Matches:
+        return np.array([[len(first.features), len(second.features)]], np.int32)
+
+
+def test_threads_that_ask_together_make_it_once() -> None:
+    made: list[str] = []
+
+    def make() -> Finds:
+        sleep(0.05)
+        made.append("once")
+        return Finds()
+
+    extractor = DeferredExtractor("finds-1", make)
+    assert (extractor.name, made) == ("finds-1", [])
+    with ThreadPoolExecutor(4) as pool:
+        views = list(pool.map(lambda _: extractor.extract(np.zeros((4, 4, 3), np.uint8), CAMERA), range(8)))
+    assert all(it is VIEW for it in views)
+    assert made == ["once"]
+
+
+def test_weights_that_changed_since_the_start_are_named() -> None:
+    with pytest.raises(RuntimeError, match="the weights of finds-2 have changed since the start: they are finds-1"):
+        DeferredExtractor("finds-2", Finds).made()
+
+
+def test_a_network_that_was_not_made_is_tried_again() -> None:
+    failures = [OSError("no file")]
+
+    def make() -> Pairs:
+        if failures:
+            raise failures.pop()
+        return Pairs()
+
+    matching = DeferredPairMatching("pairs-1", make)
+    scene = make_scene(random_for("deferred"))
+    with pytest.raises(OSError, match="no file"):
+        matching.match_one(scene.query, VIEW)
+    assert matching.match_one(scene.query, VIEW).tolist() == [[len(scene.query.features), 0]]
