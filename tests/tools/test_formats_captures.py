@@ -69,6 +69,28 @@ def test_depths_of_transforms_are_scaled_with_the_poses(tmp_path: Path) -> None:
     assert scaled.unit_m == 0.0005
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.uint16])
+def test_depths_of_transforms_may_be_arrays(tmp_path: Path, kind: type) -> None:
+    folder = write_transforms(tmp_path)
+    values = np.arange(64 * 96).reshape(64, 96, 1)
+    np.save(folder / "depth.npy", np.asfortranarray(values.astype(kind)))
+    edit(folder / "transforms.json", lambda it: it["frames"][0].update(depth_file_path="depth.npy"))
+    depth = read_dataset(folder).frames[0].depth
+    assert depth is not None
+    image = depth.read()
+    assert (image.size, image.unit_m) == ((96, 64), 0.001)
+    np.testing.assert_array_equal(np.frombuffer(image.data, "<f4"), np.arange(64 * 96))
+
+
+@pytest.mark.parametrize("array", [np.ones((64, 96, 3)), np.ones(96), np.array([["a"]]), np.ones((64, 96), complex)])
+def test_arrays_that_are_no_depth_are_left_out(tmp_path: Path, array: np.ndarray) -> None:
+    folder = write_transforms(tmp_path)
+    np.save(folder / "depth.npy", array)
+    edit(folder / "transforms.json", lambda it: it["frames"][0].update(depth_file_path="depth.npy"))
+    dataset = read_dataset(folder)
+    assert (dataset.frames[0].depth, "is no depth" in dataset.notes[-1]) == (None, True)
+
+
 def test_depths_of_nerfcapture_have_their_own_unit(tmp_path: Path) -> None:
     folder = write_transforms(tmp_path, integer_depth_scale=0.0005)
     (folder / "depth.png").write_bytes(encode(".png", np.ones((64, 96), np.uint16)))

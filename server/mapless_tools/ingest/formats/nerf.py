@@ -4,10 +4,9 @@ Read are `frames`, each with `file_path` (with or without ending) and `transform
 OpenGL's camera axes); in a frame or for all, `fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`, `camera_angle_x`, `camera_angle_y`,
 `camera_model`, `is_fisheye`, k1 to k4, p1 and p2; and for all `applied_transform` and `applied_scale`, which are
 undone, and `train_filenames`, `val_filenames`, `test_filenames`. A frame's `mask_path` is its mask: black pixels are
-ignored, as in nerfstudio. A frame's `depth_file_path` is its depth, of the same camera: a PNG of 16 bits in thousandths
-of the unit of the poses before `applied_scale`, nerfstudio's `depth_unit_scale_factor`; or its `depth_path` is, in
-`integer_depth_scale` of that unit, as instant-ngp's nerfcapture2nerf.py writes it. Other depth, such as .npy, is left
-out with a note.
+ignored, as in nerfstudio. A frame's `depth_file_path` is its depth, of the same camera: a PNG of 16 bits or a .npy in
+thousandths of the unit of the poses before `applied_scale`, nerfstudio's `depth_unit_scale_factor`; or its `depth_path`
+is, a PNG in `integer_depth_scale` of that unit, as instant-ngp's nerfcapture2nerf.py writes it.
 
 Pixels: nerfstudio shoots the ray of pixel (0, 0) through (0.5, 0.5), so principal points count from the corner.
 """
@@ -22,6 +21,7 @@ from mapless.lenses import Distortion, Fisheye, RadialTangential
 from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named, read_json
 
 from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, size_of
+from .depth_files import decode_npy
 
 FILE_NAME = "transforms.json"
 SPLIT_FILES = {"transforms_train.json": "train", "transforms_val.json": "test", "transforms_test.json": "test"}
@@ -88,7 +88,8 @@ def _depth(collector: Collector, frame: Mapping[str, Any], camera: Camera) -> De
             return None
     if path is None:
         return None
-    return collector.depth(DepthFile(Path(str(path)), unit), (camera.width_px, camera.height_px))
+    decode = decode_npy if str(path).endswith(".npy") else None
+    return collector.depth(DepthFile(Path(str(path)), unit, decode=decode), (camera.width_px, camera.height_px))
 
 
 def _world_from_camera(frame: Mapping[str, Any], scale: float, world_from_original: RigidTransform) -> RigidTransform:

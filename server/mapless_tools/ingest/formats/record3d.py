@@ -19,7 +19,7 @@ from mapless.geometry import Camera, RigidTransform
 from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named, read_json
 
 from .collecting import Collector, ReadOptions, from_corner, from_opengl, natural_order, rotation_of, size_of
-from .exr import decode_exr
+from .depth_files import decode_exr
 
 METADATA = "metadata.json"
 _IMAGE_ENDS = (".jpg", ".jpeg", ".png")
