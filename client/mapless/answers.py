@@ -287,6 +287,7 @@ class LocalizationResult:
         if self.debug is not None and (counts := self.debug.inliers_by_source()):
             points = ", ".join(f"{count} {POINT_SOURCES.get(it, it)}" for it, count in counts.items() if count)
             text.append(f"  points    {points}")
+        text += [f"  depth     {it}" for it in (self.diagnostics.depth_check,) if it is not None]
         text += [f"  cut       {it}" for it in self.diagnostics.ladder_cuts]
         if self.arbitrary_unit:
             text.append("  warning   the scene's unit of length is arbitrary, not the metre")

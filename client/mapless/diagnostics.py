@@ -117,6 +117,13 @@ class DepthCheck:
     conflict: bool
     used: bool
 
+    def __str__(self) -> str:
+        if not self.factor:
+            return f"{self.keypoint_count} keypoints have one, too few to compare ({self.compared_count})"
+        outcome = "contradicts the photograph, not used" if self.conflict else "used" if self.used else "not needed"
+        factor = f"{self.factor:.4g} (+- {100 * self.factor_sigma:.2g} %) times the pose's"
+        return f"{self.agreeing_count} of {self.compared_count} agree, {factor}: {outcome}"
+
 
 @dataclass(frozen=True)
 class Diagnostics:

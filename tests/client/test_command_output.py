@@ -16,6 +16,7 @@ from mapless.cameras import read_camera
 from mapless.cli.arguments import make_parser
 from mapless.cli.localize import priors
 from mapless.cli.output import line, plain
+from mapless.diagnostics import DepthCheck
 from mapless.geometry import Camera, RigidTransform, Similarity
 from mapless.groups import GroupRejected, RigLocalization, SequenceLocalization, TrackingJump
 from mapless.lenses import Fisheye
@@ -73,12 +74,38 @@ def test_low_trust_is_warned_of() -> None:
 )
 def test_a_coarse_pose_is_not_called_localized(is_final: bool, first: str) -> None:
     coarse = localized(
-        pose_stage="COARSE", covariance=None, accuracy=None, trust=None, prior_checks=(), is_final=is_final
+        pose_stage="COARSE", covariance=None, accuracy=None, trust=None, prior_checks=(), is_final=is_final, debug=None
     )
     printed = lines(coarse)
     assert printed[0] == first
     assert printed[-1] == "  support   not verified, 0.30 s"
     assert not [line for line in printed if "within" in line]
+
+
+@pytest.mark.parametrize(
+    ("check", "text"),
+    [
+        (
+            DepthCheck(900, 90, 88, 1.012, 0.002, False, True),
+            "88 of 90 agree, 1.012 (+- 0.2 %) times the pose's: used",
+        ),
+        (
+            DepthCheck(900, 90, 9, 998.0, 0.3, True, False),
+            "998 (+- 30 %) times the pose's: contradicts",
+        ),
+        (DepthCheck(900, 90, 88, 1.0, 0.002, False, False), "pose's: not needed"),
+        (DepthCheck(900, 3, 0, 0.0, 0.0, False, False), "900 keypoints have one, too few to compare (3)"),
+    ],
+)
+def test_the_photographs_depth_has_its_line(check: DepthCheck, text: str) -> None:
+    answer = localized(diagnostics=replace(diagnostics(), depth_check=check))
+    (found,) = (line for line in lines(answer) if line.startswith("  depth "))
+    assert text in found
+    assert not any(line.startswith("  depth ") for line in lines(localized()))
+
+
+def test_points_are_counted_by_what_gives_their_distance() -> None:
+    assert "  points    130 triangulated, 50 by measured depth" in lines(localized())
 
 
 def test_a_rejection_names_the_reference_that_shares_most() -> None:

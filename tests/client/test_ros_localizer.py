@@ -30,7 +30,7 @@ class PlantedClient:
         self.priors.append(priors.pose)
         if isinstance(self.plant, Exception):
             raise self.plant
-        about = SimpleNamespace(request_id="r", total_s=0.2, queue_s=0.0, references=())
+        about = SimpleNamespace(request_id="r", total_s=0.2, queue_s=0.0, references=(), depth_check=None)
         if self.plant is not None:
             return Rejected(**({"diagnostics": about} | self.plant))
         time_s = capture_time.timestamp() - at(0) / 1e9
@@ -229,7 +229,7 @@ def test_a_rejected_image_is_localized_with_those_before(client: PlantedClient) 
     def localize_sequence(frames: list[SequenceFrame], scene: str, **_: Any) -> Any:
         sent.append(frames)
         poses = tuple(MAP_FROM_ODOM.compose(it.session_from_camera) for it in frames)
-        about = SimpleNamespace(request_id="s", total_s=0.5, queue_s=0.0, references=())
+        about = SimpleNamespace(request_id="s", total_s=0.5, queue_s=0.0, references=(), depth_check=None)
         report = ImageReport(5, 9, "LOW_OVERLAP", about)  # type: ignore[arg-type]
         accuracy = Accuracy(0.01, 0.02, 0.1, 0.2, False)
         world_from_session = Similarity(1.0, np.eye(3), np.zeros(3))

@@ -315,6 +315,8 @@ def _values(answer: _Answer) -> dict[str, str]:
     values |= {"inliers": str(answer.inlier_count), "matches": str(answer.match_count)}
     if isinstance(answer, SequenceLocalization):
         values |= {"images": str(len(answer.images)), "jumps": str(len(answer.jumps))}
+    if about.depth_check is not None:
+        values["depth_check"] = str(about.depth_check)
     if answer.trust is not None:
         values["trust"] = f"{answer.trust:.3f}"
     if answer.accuracy is not None:

@@ -285,6 +285,7 @@ def _facts(used: Diagnostics, camera: Camera) -> dict[str, str]:
         "focal lengths": f"{camera.focal_x_px:.1f}, {camera.focal_y_px:.1f} px",
         "principal point": f"{camera.principal_x_px:.1f}, {camera.principal_y_px:.1f} px",
         "lens distortion": lens,
+        "the photograph's depth": "none" if used.depth_check is None else str(used.depth_check),
         "request": used.request_id,
         "server": f"mapless {used.server_version}",
     }
