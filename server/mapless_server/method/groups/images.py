@@ -1,6 +1,10 @@
 """The photographs of a group with their matches, in one common world.
 
 A photograph that was rejected alone still has matches, and those of the group together may be enough for a pose.
+
+A point that one reference observes has its distance from a depth: the reference's, or the photograph's own at the pose
+that its own answer gives it. The group knows no errors that depths share, so each of n depths has n times the variance
+of these, besides its own: together they hold the scale no firmer than one.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
-from ..bundle.estimate import Support, observers
+from ..bundle.estimate import PosedSupport, Support, observers
 from ..bundle.priors import NO_PRIORS, IntrinsicsSigma, Priors
 from ..features.limits import INLIER_PX
 from ..judge.answer import Answer, Localization
@@ -26,7 +30,7 @@ from ..pose.generalized import CameraMatches
 from ..pose.pnp import MIN_MATCHES, failure_by_chance, log10_false_alarms
 from ..rejection import Rejection, RejectionReason
 from ..structure.match import MatchOptions, search
-from ..structure.model import PointMatches, ScaleSource
+from ..structure.model import DepthPlanes, PointMatches, ScaleSource, Structure
 
 MIN_FOUND_SHARE = 0.08
 """Least share of inliers among the points inside the images, or among the photographs' features if they are fewer.
@@ -63,12 +67,16 @@ class MatchedImage(Support):
         own_pose: world_from_camera of its own answer; None if it is rejected.
         own_covariance: (6, 6) covariance of `own_pose`, order x y z rx ry rz, fixed world axes, metres and radians.
         match: see GroupImage.
+        own_trust: trust in `own_pose` if depths give it, whose evidence needs no second reference; else 0.
+        own_count: number of its inliers.
     """
 
     image: int
     own_pose: RigidTransform | None
     own_covariance: Array | None
     match: MatchOptions
+    own_trust: float = 0.0
+    own_count: int = 0
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
         """Returns the matches as pixels and points of a camera with this pose in the rig."""
@@ -133,14 +141,16 @@ def matched_images_of(images: Sequence[GroupImage]) -> list[MatchedImage]:
 def _matched_image(index: int, image: GroupImage, support: Support, origin: Array) -> MatchedImage:
     offset = support.origin - origin
     outcome = image.answer.outcome
-    structure = replace(support.structure, x_in_world=support.structure.x_in_world + offset)
+    structure = _held(support).shifted(offset)
     references = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(offset)) for r in support.references)
     # Matches from a guided search around a rejected pose would be evidence for that pose.
     guided = support.matches.guided
     is_kept = ~guided if not guided.all() or isinstance(outcome, Rejection) else guided
-    own_pose, own_covariance = None, None
+    own_pose, own_covariance, own_trust, own_count = None, None, 0.0, 0
     if isinstance(outcome, Localization):
         own_pose, own_covariance = outcome.world_from_camera.shifted(-origin), outcome.covariance
+        if outcome.scale_source is not ScaleSource.REFERENCES:
+            own_trust, own_count = outcome.trust or 0.0, outcome.inlier_count
     return MatchedImage(
         query=support.query,
         references=references,
@@ -154,7 +164,33 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
         own_pose=own_pose,
         own_covariance=own_covariance,
         match=image.match,
+        own_trust=own_trust,
+        own_count=own_count,
     )
+
+
+def _held(support: Support) -> Structure:
+    """The structure with planes near which the points are that one reference observes."""
+    structure, depths = support.structure, support.query.depths
+    count = len(structure.x_in_world)
+    alone = np.bincount(structure.tracks.point, minlength=count) < 2
+    if not alone.any():
+        return structure
+    planes = structure.planes or DepthPlanes.unknown(count)
+    normal, offset, information = planes.normal.copy(), planes.offset.copy(), planes.information.copy()
+    known = alone & (information > 0)
+    shared = known.sum() * (planes.common[known] ** 2).sum(axis=1)
+    information[known] = 1 / (1 / information[known] + shared)
+    if depths is not None and isinstance(support, PosedSupport):
+        point, keypoint = support.matches.point, support.matches.keypoint
+        own = alone[point] & ~known[point] & np.isfinite(depths.depth[keypoint]) & support.estimate.inliers
+        point, keypoint, pose = point[own], keypoint[own], support.estimate.world_from_camera
+        normal[point] = pose.rotation[:, 2]
+        offset[point] = structure.x_in_world[point] @ pose.rotation[:, 2]
+        variance = depths.relative_sigma[keypoint].astype(np.float64) ** 2 + len(point) * depths.common_sigma**2
+        information[point] = 1 / (variance * depths.depth[keypoint].astype(np.float64) ** 2)
+    planes = DepthPlanes(normal, offset, information, planes.view, planes.common)
+    return replace(structure, planes=planes)
 
 
 def priors_of(images: Sequence[GroupImage], origin: Array) -> dict[int, Priors]:

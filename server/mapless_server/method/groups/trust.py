@@ -3,7 +3,9 @@
 The photographs count as one camera with several images, mounted as the joint pose says: shares are computed from sums
 over the photographs (that of matches on epipolar lines is a mean weighted by inliers), the covered parts of the
 images are added, and halves of all matches, or of all references, give poses by generalized PnP. With one
-photograph this is the evidence of `judge`, so that trust means the same for both.
+photograph this is the evidence of `judge`, so that trust means the same for both. A photograph whose own pose is by
+depths has evidence that needs no second reference: where its inliers agree with the joint pose, the trust in this is as
+large at least.
 """
 
 import math
@@ -30,6 +32,7 @@ from ..pose.generalized import CameraMatches, rig_ransac
 from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection
 from .images import PosedImage
+from .problem import ADJUST
 
 
 def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[float, Rejection | None]:
@@ -53,7 +56,10 @@ def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[floa
         _matches_apart(matched, distance_m),
         _references_apart(matched, distance_m),
     )
-    trust = trust_of(evidence, JudgeOptions())
+    by_depths = [
+        it.source.own_trust for it in matched if it.inliers.sum() >= ADJUST.min_kept_share * it.source.own_count
+    ]
+    trust = max(trust_of(evidence, JudgeOptions()), *by_depths, 0.0)
     return trust, disagreeing_references(supporters_of_group(matched)) or low_trust(evidence, trust, coverage)
 
 

@@ -142,7 +142,7 @@ def solve_by_depths(
         problem.points(solved),
         Tracks(rows, view, matches[:, 1].astype(np.intp)),
         replace(FIRST_GUESS, level_px=solved.sigma_px),
-        None if query.depths is None else _planes(problem, solved, references, view, depths),
+        None if problem.depth_sigma is None else _planes(problem, solved, references, view, depths),
     )
     found = PointMatches(rows, matches[:, 0].astype(np.intp), np.zeros(len(rows), bool), 0.0)
     used = tuple(matches[view == i] for i in range(len(references)))

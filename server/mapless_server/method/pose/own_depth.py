@@ -13,7 +13,8 @@ share errors, so they count as of `REGIONS` regions (see `structure.kept_depth`)
 
 It is evidence, too. At a wrong pose a factor agrees with its prior by chance, and depths with one another where they
 differ by more than their errors: the chances multiply. But a photograph may come with another one's depth, or in
-another unit: of a hundred one, say. So depths that disagree speak against a pose by that, and no more.
+another unit: of a hundred one, say. So depths that disagree speak against a pose by that, and no more. Depths of which
+less fit than of right ones, as of a mirrored image, move nothing.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from ..bundle.priors import LIKELY_PROBABILITY, MIN_RELATIVE_INFORMATION, confli
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import cauchy_weight, moved, solve_columns, symmetric_products
+from ..structure.depth_mistakes import FITTING_SHARE
 from ..structure.kept_depth import REGIONS
 from ..structure.model import Structure
 from ..structure.structure import observe
@@ -163,6 +165,8 @@ def improved(support: PosedSupport) -> PosedSupport:
 def _improved(estimate: PoseEstimate, comparison: DepthComparison) -> PoseEstimate:
     check = estimate.depth_check
     if check is None or not check.factor or check.conflict:
+        return estimate
+    if check.agreeing_count < FITTING_SHARE * check.compared_count:
         return estimate
     gradient, information = comparison.gradient_and_information(estimate.covariance)
     gain = float(np.abs(np.linalg.eigvals(information @ estimate.covariance)).max())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -166,6 +166,11 @@ class Structure:
         points = np.argsort(np.minimum.reduceat(keypoint, tracks.starts))
         moved = Tracks.in_order(np.argsort(points)[tracks.point], view, tracks.keypoint)
         return Structure(self.x_in_world[points] + offset, moved, self.noise)
+
+    def shifted(self, offset: Array) -> Structure:
+        """The structure in a world in which everything lies `offset` (3,) further."""
+        planes = self.planes and replace(self.planes, offset=self.planes.offset + self.planes.normal @ offset)
+        return Structure(self.x_in_world + offset, self.tracks, self.noise, planes)
 
     def and_last(self, x_in_world: Array, tracks: Tracks, planes: DepthPlanes | None = None) -> Structure:
         """Appends points (Q, 3) with their tracks; without `planes`, none of these is near a plane."""
