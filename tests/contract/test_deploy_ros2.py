@@ -144,9 +144,19 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
             node.destroy_node()
 
 
-def test_a_parameter_that_cannot_be_used_ends_the_node(node_module: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(StandInNode, "parameters", {"scene": ""})
-    with pytest.raises(SystemExit, match="scene is empty"):
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"scene": ""}, "scene is empty"),
+        ({"scene": "hall", "depth": True, "depth_sensor": "lidar"}, "depth_sensor must be one of unknown, .*'lidar'"),
+        ({"scene": "hall", "depth": True, "depth_tolerance": -1.0}, "depth_tolerance must be 0 to 1 s"),
+    ],
+)
+def test_a_parameter_that_cannot_be_used_ends_the_node(
+    node_module: Any, monkeypatch: pytest.MonkeyPatch, given: dict[str, Any], message: str
+) -> None:
+    monkeypatch.setattr(StandInNode, "parameters", given)
+    with pytest.raises(SystemExit, match=message):
         node_module.main()
 
 

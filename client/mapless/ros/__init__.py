@@ -11,7 +11,7 @@ image is the optical frame. The world is the scene's; for ROS it should have z u
 
 from .camera_infos import CameraInfos, rectified_differs, says_rectified
 from .cameras import RosCamera, camera_from_info
-from .depths import Depths, RosDepth
+from .depths import Depths, RosDepth, sensor_of
 from .images import pixels_from_image
 from .localizer import Localizer, LocalizerOptions, Outcome
 from .messages import Messages
@@ -31,6 +31,7 @@ __all__ = [
     "pose_of_body",
     "rectified_differs",
     "says_rectified",
+    "sensor_of",
     "stamp_ns_of",
     "transform_from_message",
     "transform_from_pose",

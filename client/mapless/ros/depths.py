@@ -91,6 +91,14 @@ def depth_image(values: Values, sensor: DepthSensor = DepthSensor.UNKNOWN) -> De
     return DepthImage(file.tobytes(), 0.001, sensor=sensor)
 
 
+def sensor_of(name: str) -> DepthSensor:
+    """The kind of sensor that the parameter depth_sensor names; ValueError for another name."""
+    known = {it.value: it for it in DepthSensor}
+    if name not in known:
+        raise ValueError(f"depth_sensor must be one of {', '.join(known)}, is {name!r}")
+    return known[name]
+
+
 @dataclass(frozen=True, eq=False)
 class RosDepth:
     """A depth message, with the camera of its CameraInfo, or None if it has none.

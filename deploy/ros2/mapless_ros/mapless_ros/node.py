@@ -88,8 +88,8 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         self._is_camera_said = False
         self._depths: mapless.ros.Depths | None = None
         if self._given["depth"]:
-            known = mapless.DepthSensor(self._given["depth_sensor"])
-            self._depths = mapless.ros.Depths(known, self._given["depth_tolerance"])
+            kind_of_sensor = mapless.ros.sensor_of(self._given["depth_sensor"])
+            self._depths = mapless.ros.Depths(kind_of_sensor, self._given["depth_tolerance"])
         self._image: Any = None
         self._edge: tuple[str, RigidTransform] | None = None
         self._is_triggered = self._is_closed = False
