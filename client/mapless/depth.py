@@ -19,6 +19,8 @@ _SENSORS: wire.ProtoEnum = pb.DepthSensor
 
 MIN_UNIT_M, MAX_UNIT_M = 1e-6, 100.0
 """Bounds of the values of depth images."""
+PLAUSIBLE_DEPTHS = 0.05, 200.0
+"""Bounds of the median depth of a photograph, metres: with others the unit is most likely wrong."""
 MAX_APART_M, MAX_TURNED_DEG = 1.0, 45.0
 """From a photograph's camera to its depth camera, and between their viewing directions."""
 

@@ -105,7 +105,8 @@ class DepthCheck:
         factor: the most probable factor by which all measured depths are longer than those of the pose; 0 where nothing
             was compared.
         factor_sigma: its standard deviation, as a share.
-        conflict: whether the depths contradict the pose; then they were not used for it.
+        conflict: whether the depths contradict the pose, or their own matches, or cannot be metres; they do not correct
+            the pose then.
         used: whether the depths contributed to the pose.
     """
 

@@ -106,6 +106,7 @@ class Prepared:
         context: cancels the computation and times its stages.
         priors: priors on the query's pose, in the world of `references`.
         is_metric: whether the unit of the references' poses is the metre.
+        implausible_depths: number of the query's keypoints with depths that cannot be metres, and are not used.
     """
 
     query: View
@@ -119,6 +120,7 @@ class Prepared:
     context: StageContext
     priors: Priors = NO_PRIORS
     is_metric: bool = True
+    implausible_depths: int = 0
 
     @property
     def unit(self) -> str:
@@ -168,13 +170,16 @@ class Coarse:
         inliers = support.inliers_by_reference() if support else (0,) * len(prepared.references)
         seconds = dict(prepared.context.stage_seconds)
         stationary_count = prepared.correspondences.stationary_count
-        check = _depth_check(prepared.query, support)
+        check = _depth_check(prepared, support)
         made = Answer(outcome, scale, seconds, matches, inliers, support, stationary_count, check)
         return shifted(made, prepared.origin)
 
 
-def _depth_check(query: View, support: Support | None) -> DepthCheck:
+def _depth_check(prepared: Prepared, support: Support | None) -> DepthCheck:
     """How the query's depth compares with the pose of a support, if it has one; without counts without depth."""
+    if prepared.implausible_depths:
+        return DepthCheck(prepared.implausible_depths, conflict=True)
+    query = prepared.query
     if query.depths is None:
         return NO_DEPTH
     check = support.estimate.depth_check if isinstance(support, PosedSupport) else None
@@ -205,9 +210,13 @@ def prepare(
     origin = references[0].world_from_camera.translation
     nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
     bucket = pipeline.reconstructor.bucket(query, nearby)
+    implausible = 0
     if query.photograph is not None and query.photograph.read_depth is not None:
         with context.stage("depth"):
             query = query.with_depths()
+            depths = query.depths
+            if is_metric and depths is not None and not depths.is_plausible:
+                query, implausible = replace(query, depths=None), int(np.isfinite(depths.depth).sum())
     with context.stage("correspond"):
         correspondences = pipeline.matcher.correspond(
             query, references, check=context.check, query_matches=query_matches
@@ -224,6 +233,7 @@ def prepare(
         context=context,
         priors=priors.shifted(-origin),
         is_metric=is_metric,
+        implausible_depths=implausible,
     )
 
 

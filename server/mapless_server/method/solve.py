@@ -37,7 +37,7 @@ from .judge.two_view import (
 from .options import DoubtOptions, Variant
 from .pipeline import Coarse, structure_and_matches, unverified, wide_correspondences, with_wide_correspondences
 from .pose.one_reference import MatchedDepths, solve_by_depths
-from .pose.own_depth import checked, improved
+from .pose.own_depth import checked, contradicted, improved
 from .pose.pnp import gate_failure, solve_pose
 from .pose.two_view import TwoViewOptions, solve_two_view
 from .rejection import Rejection, RejectionReason
@@ -162,7 +162,7 @@ def _by_depths(
     estimate = replace(estimate, prior_checks=tuple(replace(it, used=False) for it in checks))
     support = replace(found.support, estimate=estimate)
     if prepared.query.depths is not None:
-        support = improved(support)
+        support = contradicted(improved(support), found.excess)
     estimate = support.estimate
     trust = trust_of_score(found.score - estimate.depth_log10_chance)
     failure = one_reference_failure(found, trust, prepared.options.coverage) or one_reference_radius_failure(found)

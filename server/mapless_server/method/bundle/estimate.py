@@ -45,7 +45,7 @@ class DepthCheck:
         agreeing_count: those of them whose depths agree within the errors of sensor and points.
         factor: the most probable factor by which the measured depths are longer than those of the pose; 0 for none.
         factor_sigma: its standard deviation, as a share.
-        conflict: whether the depths contradict the pose, and were not used.
+        conflict: whether the depths contradict the pose, or their own matches, or cannot be metres.
         used: whether the depths contributed to the pose.
     """
 

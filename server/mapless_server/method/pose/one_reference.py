@@ -96,12 +96,14 @@ class Found:
         score: the larger, the less likely are so many inliers among wrong matches.
         moved_score: the same for those matches that are at other pixels than in the reference; see `judge.references`.
         own_covariance: (6, 6) the estimate's without the error that all depths share.
+        excess: ratio of the depths' errors, by the residuals, to those stated; at least 1.
     """
 
     support: PosedSupport
     score: float
     moved_score: float
     own_covariance: Array
+    excess: float = 1.0
 
 
 def solve_by_depths(
@@ -151,7 +153,8 @@ def solve_by_depths(
     for i, (reference, its) in enumerate(zip(references, used, strict=True)):
         moved[view == i] = are_moved(query, reference, its, its, stationary)
     some = replace(solved, inliers=solved.inliers[moved], errors_px=solved.errors_px[moved])
-    return Found(support, score_of(problem, solved), score_of(problem[moved], some), own)
+    excess = _excess(problem, solved)
+    return Found(support, score_of(problem, solved), score_of(problem[moved], some), own, excess)
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,7 +388,13 @@ def _factor_covariance(problem: _Problem, solved: _Solved) -> Array:
     motion = -np.linalg.pinv(hessian[:6, :6], hermitian=True) @ hessian[:6, 6]
     of_factor = max(0.0, float(hessian[6, 6] + hessian[6, :6] @ motion)) / _shared(solved)
     moved = world_jacobian(solved.world_from_camera) @ motion
-    return np.asarray(np.outer(moved, moved) / (of_factor + problem.turned.common_sigma**-2))
+    common_sigma = _excess(problem, solved) * problem.turned.common_sigma
+    return np.asarray(np.outer(moved, moved) / (of_factor + common_sigma**-2))
+
+
+def _excess(problem: _Problem, solved: _Solved) -> float:
+    """Ratio of the depths' errors to those stated, at least 1; so much larger is what they share, too (Birge)."""
+    return 1.0 if problem.depth_sigma is None else max(1.0, solved.depth_sigma / problem.depth_sigma)
 
 
 def _reference_covariance(problem: _Problem, solved: _Solved, reference_centre: Array) -> Array:

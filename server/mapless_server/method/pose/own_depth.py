@@ -162,6 +162,16 @@ def improved(support: PosedSupport) -> PosedSupport:
     return replace(support, estimate=_improved(_checked(support.estimate, comparison), comparison))
 
 
+def contradicted(support: PosedSupport, excess: float) -> PosedSupport:
+    """The support of a pose by depths, with a conflict if their errors exceed those stated as no right depth's do."""
+    check, chance = support.estimate.depth_check, support.estimate.depth_log10_chance
+    if check is None or check.factor or excess <= INLIER_SIGMA:
+        return support
+    chance -= math.log10(LIKELY_PROBABILITY)
+    estimate = replace(support.estimate, depth_check=replace(check, conflict=True), depth_log10_chance=chance)
+    return replace(support, estimate=estimate)
+
+
 def _improved(estimate: PoseEstimate, comparison: DepthComparison) -> PoseEstimate:
     check = estimate.depth_check
     if check is None or not check.factor or check.conflict:

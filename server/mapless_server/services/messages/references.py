@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from mapless import names, wire
+from mapless.depth import PLAUSIBLE_DEPTHS
 from mapless.provenance import GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
 from mapless.scenes import (
     Calibration,
@@ -126,10 +127,6 @@ def implausible_depths(medians: Mapping[str, float | None]) -> list[str]:
     first, depth = next(iter(wrong.items()))
     others = f", and those of {len(wrong) - 1} more are as far" if len(wrong) > 1 else ""
     return [f"the median depth of reference {first!r} is {depth:.3g}{others}: is unit_m right, 0.001 for millimetres?"]
-
-
-PLAUSIBLE_DEPTHS = 0.05, 200.0
-"""Median depths of sensors, metres; other units differ by a thousand."""
 
 
 def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesResponse:
