@@ -1,12 +1,17 @@
-"""Importers: our own cameras.json, nerfstudio's transforms.json, captures of phones, TUM RGB-D, kapture with a rig."""
+"""Importers: our own cameras.json, nerfstudio's transforms.json, captures of phones, TUM RGB-D, ICL-NUIM, kapture.
+
+Some have depth; what is read of it must be usable.
+"""
 
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from support.depths import png
 from support.layouts import opengl
 
+from mapless.geometry import RigidTransform
 from mapless_tools.ingest.formats import Intrinsics, ReadOptions
 from mapless_tools.ingest.formats.writing import PosedImage, cameras_files, kapture_files
 
@@ -77,6 +82,46 @@ def _with_intrinsics(folder: Path) -> ReadOptions:
     return ReadOptions(intrinsics=Intrinsics(30.0, 31.0, 15.25, 16.75))
 
 
+def _values(unit_m: float) -> np.ndarray:
+    """Depths of 1 to 2 m of a photograph of 32x33 pixels, in a unit."""
+    return np.linspace(1 / unit_m, 2 / unit_m, 33 * 32).reshape(33, 32)
+
+
+def _associations() -> dict[str, bytes]:
+    rows = []
+    for i, pose in enumerate(TRUTH.poses):
+        q = pose.quaternion()
+        rows.append(f"{i} {numbers(pose.translation)} {numbers([q.x, q.y, q.z, q.w])}")
+    lines = [f"{i} depth.png {i} images/{i}.png" for i in range(3)]
+    return {
+        "associations.txt": "\n".join(lines).encode(),
+        "livingRoom0.gt.freiburg": "\n".join(rows).encode(),
+        "depth.png": png(_values(1 / 5000).astype(np.uint16)),
+    }
+
+
+def _record3d() -> bytes:
+    poses = []
+    for pose in TRUTH.poses:
+        q = RigidTransform.from_matrix(opengl(pose)).quaternion()
+        poses.append([q.x, q.y, q.z, q.w, *pose.translation.tolist()])
+    k = [_K[0], 0, 0, 0, _K[1], 0, _K[2], _K[3], 1]
+    return _json({"w": 32, "h": 33, "K": k, "poses": poses, "perFrameIntrinsicCoeffs": [list(_K)]})
+
+
+def _kapture_depth() -> dict[str, bytes]:
+    tables = _kapture()
+    depth = b"depth1, structured_light, depth, PINHOLE, 32, 33, 30, 31, 16, 17\n"
+    (at_first,) = (row for row in tables["sensors/trajectories.txt"].splitlines() if row.startswith(b"0, camera1"))
+    return {
+        "sensors/sensors.txt": tables["sensors/sensors.txt"] + depth,
+        "sensors/trajectories.txt": tables["sensors/trajectories.txt"] + at_first.replace(b"camera1", b"depth1"),
+        "sensors/records_camera.txt": tables["sensors/records_camera.txt"],
+        "sensors/records_depth.txt": b"# kapture format: 1.1\n0, depth1, 0.depth\n",
+        "sensors/records_data/0.depth": _values(1.0).astype("<f4").tobytes(),
+    }
+
+
 _FRAMES = ("frame_00000", "frame_00010")
 _KEYFRAMES = "keyframes/corrected_cameras", "keyframes/corrected_images"
 LAYOUTS = (
@@ -109,6 +154,9 @@ LAYOUTS = (
         _with_intrinsics,
     ),
     Layout("kapture", "rig", _kapture(), [f"sensors/records_data/{i}.png" for i in range(3)]),
+    Layout("kapture", "depth", _kapture_depth(), [f"sensors/records_data/{i}.png" for i in range(3)]),
+    Layout("icl", "traj0", _associations(), _IMAGES),
+    Layout("record3d", "EXR_RGBD", {"metadata.json": _record3d()}, [f"rgb/{i}.jpg" for i in range(3)]),
 )
 
 TARGET = target(

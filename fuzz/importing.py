@@ -20,6 +20,7 @@ from support.layouts import truth
 
 from mapless.geometry import Camera
 from mapless.names import check_id
+from mapless_server.images import ImageLimits, decode_depth
 from mapless_tools.dataset import SPLITS, Dataset
 from mapless_tools.ingest.depth_options import DepthOptions
 from mapless_tools.ingest.formats import ReadOptions, read_dataset, recognize
@@ -124,6 +125,8 @@ def check_folder(folder: Path, layout: Layout, is_thorough: bool = True) -> bool
         assert frame.image_path.is_relative_to(folder)
         assert ".." not in frame.image_path.parts
         check_camera(frame.camera)
+        if frame.depth is not None and layout.format != "cameras":  # where a wrong depth refuses its frame later
+            decode_depth(frame.depth.read(), (frame.camera.width_px, frame.camera.height_px), ImageLimits())
         assert np.isfinite(frame.world_from_camera.matrix()).all()
     check_pose(dataset.frames[-1].world_from_camera)
     if is_thorough:
