@@ -155,7 +155,7 @@ def alone_rows(found: Sequence[Outcome]) -> Iterator[str]:
     yield "|---|---|---|---|---|---|---|"
     one = [it for it in found if it.kind == "one"]
     places = [*dict.fromkeys(it.place for it in one)]
-    for name, some in [*((p, [p]) for p in places), ("all", places)]:
+    for name, some in [*((p, [p]) for p in places), *([("all", places)] if places else [])]:
         its = [it for it in one if it.place in some]
         right = [it for it in its if it.is_localized]
         away = [it for it in found if it.kind == "elsewhere" and it.place in some]
@@ -163,7 +163,7 @@ def alone_rows(found: Sequence[Outcome]) -> Iterator[str]:
             name,
             ratio(len(right), len(its)),
             str(sum(it.share > WRONG_SHARE for it in right)),
-            f"{100 * np.median([it.share for it in right]):.2f} %",
+            f"{100 * np.median([it.share for it in right]):.2f} %" if right else "",
             ratio(sum((it.of_68 or 0) <= 1 for it in right), len(right)),
             ratio(sum((it.of_95 or 0) <= 1 for it in right), len(right)),
             f"{sum(it.is_localized for it in away)} of {len(away)}",
