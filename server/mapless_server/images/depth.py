@@ -70,7 +70,8 @@ def decode_depth(
     check_depth(depth, photo, limits, field)
     if depth.size is None:
         steps = _decoded(depth.data, np.uint16, f"{field}.png")
-        values = np.where((steps == 0) | (steps == _SATURATED), np.float32(np.nan), steps.astype(np.float32))
+        values = steps.astype(np.float32)
+        values[(steps == 0) | (steps == _SATURATED)] = np.nan
     else:
         values = np.frombuffer(depth.data, "<f4").reshape(depth.size[::-1])
         if (values < 0).any():
@@ -83,7 +84,8 @@ def decode_depth(
     if np.isnan(values).all():
         message = "no pixel of the depth has a value that is used"
         raise InvalidArgument(message, reason="DEPTH_EMPTY", field=field)
-    return np.asarray(values * np.float32(depth.unit_m), np.float32)
+    values *= np.float32(depth.unit_m)
+    return values
 
 
 def _checked_png(data: bytes, bits: int, limits: ImageLimits, field: str) -> tuple[int, int]:
