@@ -1,8 +1,8 @@
 """Whether the depths that sensors measured with references fit what other references see.
 
-A reference with depth is compared with the references that look most similar, and share matches with it that agree
-with their poses: by the points that it triangulates with them, and by their depths. See
-`method.structure.depth_mistakes`.
+A reference with depth is compared with the references that look most similar, if they share matches that agree with
+their poses: by the points that it triangulates with them, and by their depths. If none shares enough, by their depths
+alone. See `method.structure.depth_mistakes`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -101,21 +101,21 @@ class DepthChecks:
     def _compared(
         self, scene_key: SceneKey, subject: PosedView, others: Sequence[PosedView], check: Callable[[], None]
     ) -> DepthCheck:
-        parts: list[SeenDepths] = []
-        names, next_place = [], len(subject.view.features)
+        matches = {}
         for other in others:
             check()
-            matches = self._matches(subject, other)
-            if len(matches) < MIN_PLACES:
-                continue
-            names.append(_id_of(other))
-            parts.append(triangulated_depths(subject, other, matches))
+            matches[other.key] = self._matches(subject, other)
+        overlapping = [it for it in others if len(matches[it.key]) >= MIN_PLACES]
+        parts: list[SeenDepths] = []
+        next_place = len(subject.view.features)
+        for other in overlapping or others:
+            parts.append(triangulated_depths(subject, other, matches[other.key]) if overlapping else SeenDepths.of([]))
             if _has_depth(other):
-                depth, count = self._depth(scene_key, other), GRID // len(others)
+                depth, count = self._depth(scene_key, other), GRID // len(overlapping or others)
                 parts.append(depths_of_neighbour(subject, other, depth, next_place, count))
                 next_place += len(parts[-1])
-        verdict = judge_depth(subject, self._depth(scene_key, subject), SeenDepths.of(parts))
-        return DepthCheck(verdict, tuple(names))
+        verdict = judge_depth(subject, self._depth(scene_key, subject), SeenDepths.of(parts), bool(overlapping))
+        return DepthCheck(verdict, tuple(_id_of(it) for it in overlapping or others))
 
     def _matches(self, subject: PosedView, other: PosedView) -> Matches:
         """Matches (M, 2) of keypoints that agree with both poses."""

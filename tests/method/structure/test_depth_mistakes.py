@@ -110,6 +110,14 @@ def test_without_points_one_of_two_depths_is_in_doubt() -> None:
     assert "1.1 times as long as the depth of its neighbours" in long.doubt
 
 
+def test_poses_that_no_matches_confirm_shift_images_but_change_no_factor() -> None:
+    seen = SeenDepths.of([depths_of_neighbour(FIRST, SECOND, measured(1), 10_000)])
+    mirrored = judge_depth(FIRST, measured(0, lambda it: it[:, ::-1]), seen, are_poses_right=False)
+    assert (mirrored.mistake, mirrored.doubt) == ("", "")
+    long = judge_depth(FIRST, measured(0, longer(1.1)), seen, are_poses_right=False)
+    assert (long.mistake, "1.1 times as long" in long.doubt) == ("", True)
+
+
 def test_too_few_places_say_nothing() -> None:
     few = triangulated_depths(FIRST, SECOND, MATCHES[:10])
     found = judge_depth(FIRST, measured(0, lambda it: it[:, ::-1]), few)

@@ -121,8 +121,14 @@ class DepthVerdict:
     doubt: str = ""
 
 
-def judge_depth(subject: PosedView, depth: MeasuredDepth, seen: SeenDepths) -> DepthVerdict:
-    """Compares a reference's depth with the depths that others see in its photograph."""
+def judge_depth(
+    subject: PosedView, depth: MeasuredDepth, seen: SeenDepths, are_poses_right: bool = True
+) -> DepthVerdict:
+    """Compares a reference's depth with the depths that others see in its photograph.
+
+    Where no matches show that the poses are right, nothing but the factor between depths is judged, for wrong poses
+    shift and turn depth images against one another.
+    """
     if len(seen) < MIN_PLACES:
         return DepthVerdict(len(seen), int(seen.are_triangulated.sum()))
     compared = _Compared.of(subject, depth, seen)
@@ -132,7 +138,7 @@ def judge_depth(subject: PosedView, depth: MeasuredDepth, seen: SeenDepths) -> D
     common = LARGEST_COMMON if depth.noise == NOISE[DepthSensor.UNKNOWN] else depth.noise.common
     factor_mistake = _wrong_factor(verdict, common)
     factor_doubt = "" if factor_mistake else _differing_factor(verdict, common)
-    text, own_sigmas = compared.misread()
+    text, own_sigmas = compared.misread() if are_poses_right else ("", np.inf)
     # The factor of an image that is misread says nothing.
     mistake = text if text and own_sigmas >= OWN_SIGMAS else factor_mistake
     doubt = text if text and abs(own_sigmas) < OWN_SIGMAS else factor_doubt
