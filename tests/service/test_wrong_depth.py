@@ -9,7 +9,7 @@ import pytest
 from support.depths import png
 from support.servers import serving_really
 
-from mapless import Client, DepthImage, DepthSensor, NewReference
+from mapless import Client, DepthImage, DepthSensor, LocalizationResult, NewReference
 from mapless_tools.demo import depth_map_m, room
 
 pytestmark = pytest.mark.nightly
@@ -50,3 +50,19 @@ def test_a_wrong_depth_is_warned_of_and_found_by_the_audit(tmp_path: Path) -> No
         client.update_scene("room", arbitrary_unit=True)
         assert not any("depth" in it for it in client.get_scene("room").warnings)
         assert "WRONG_DEPTH" not in {it.verdict for it in client.audit_scene("room")}
+
+
+def test_a_depth_of_another_unit_gives_no_pose(tmp_path: Path) -> None:
+    """One reference alone would place photographs a thousand times too far away."""
+    reference = room().references[0]
+    depth = replace(depth_of(reference.name), unit_m=1.0)
+    with (
+        serving_really(tmp_path, features="sift", background_matching=False) as server,
+        Client(server.address) as client,
+    ):
+        client.create_scene("room")
+        new = NewReference("one", reference.data, reference.camera, reference.world_from_camera, depth=depth)
+        (warning,) = client.add_reference("room", new).warnings
+        assert "so it is not used: is unit_m right" in warning
+        answer = client.localize(reference.data, reference.camera, "room")
+        assert not isinstance(answer, LocalizationResult)

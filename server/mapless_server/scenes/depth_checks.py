@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from mapless_server.cache import LruCache
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.features.extractors import FeatureExtractor
-from mapless_server.method.features.views import DepthSource, Matches, PosedView
+from mapless_server.method.features.views import Matches, PosedView
 from mapless_server.method.options import StageContext
 from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.pair import in_order
@@ -89,9 +89,11 @@ class DepthChecks:
         if found is None:
             load = self._indexes.load_existing
             views = load(self._library, scene_key, [reference_id, *beside], self._extractor, context)
-            if not views or views[0].key != keys[0] or not _has_depth(views[0]):
+            if not views or views[0].key != keys[0]:
                 return None
             try:
+                if not self._has_depth(scene_key, views[0]):
+                    return None
                 found = self._compared(scene_key, views[0], views[1:], check)
             except (DataLoss, NotFound):
                 return None
@@ -110,7 +112,7 @@ class DepthChecks:
         next_place = len(subject.view.features)
         for other in overlapping or others:
             parts.append(triangulated_depths(subject, other, matches[other.key]) if overlapping else SeenDepths.of([]))
-            if _has_depth(other):
+            if self._has_depth(scene_key, other):
                 depth, count = self._depth(scene_key, other), GRID // len(overlapping or others)
                 parts.append(depths_of_neighbour(subject, other, depth, next_place, count))
                 next_place += len(parts[-1])
@@ -122,6 +124,10 @@ class DepthChecks:
         first, second = in_order(subject, other)
         matches = self._matcher.pairs.match(first, second)
         return matches if first is subject else matches[:, ::-1]
+
+    def _has_depth(self, scene_key: SceneKey, view: PosedView) -> bool:
+        """Whether a depth was measured with a reference, also one that is not used."""
+        return bool(self._store.get_reference(scene_key, _id_of(view)).depth_sha256)
 
     def _depth(self, scene_key: SceneKey, view: PosedView) -> MeasuredDepth:
         found = self._depths.get(view.key)
@@ -144,10 +150,6 @@ def depth_warnings(checks: Mapping[str, DepthCheck]) -> list[str]:
             explained |= {reference_id, *found.neighbours}
     more = [f"the depths of {len(texts) - NAMED} more references are wrong, too"] if len(texts) > NAMED else []
     return [*texts[:NAMED], *more]
-
-
-def _has_depth(view: PosedView) -> bool:
-    return view.depths is not None and view.depths.source is DepthSource.MEASURED
 
 
 def _id_of(view: PosedView) -> str:

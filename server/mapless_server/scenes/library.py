@@ -26,6 +26,7 @@ from mapless_server.method.features.views import Ignored, Photograph, PosedView,
 from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
 from mapless_server.store import DescribedReference, ReferenceRecord, SceneState, Store
+from mapless_server.store.records import SceneSnapshot
 
 from .measured import MeasuredDepths
 from .stored import DepthFinder
@@ -122,7 +123,7 @@ class ReferenceLibrary:
                 views = tuple(map(self.posed_view, snapshot.references))
                 if self._depths is not None:
                     views = self._depths.with_depths(views, extractor.name)
-                return snapshot.scene, self._with_measured_depths(snapshot.references, views, extractor.name)
+                return snapshot.scene, self._with_measured_depths(snapshot, views, extractor.name)
             if not waits:
                 self._describe_later(snapshot.undescribed, extractor)
                 raise FeaturesMissing
@@ -131,13 +132,16 @@ class ReferenceLibrary:
                 self._describe_all(snapshot.undescribed, extractor, context.check)
 
     def _with_measured_depths(
-        self, references: Sequence[DescribedReference], views: tuple[PosedView, ...], extractor: str
+        self, snapshot: SceneSnapshot, views: tuple[PosedView, ...], extractor: str
     ) -> tuple[PosedView, ...]:
         """The references with the depths that were measured with them, in place of others."""
-        if not any(it.record.depth_sha256 for it in references):
+        if not any(it.record.depth_sha256 for it in snapshot.references):
             return views
-        both = zip(references, views, strict=True)
-        return tuple(self._measured.with_depth(it.record, view, extractor) for it, view in both)
+        both = zip(snapshot.references, views, strict=True)
+        return tuple(
+            self._measured.with_depth(it.record, view, extractor, lambda: not snapshot.scene.attributes.arbitrary_unit)
+            for it, view in both
+        )
 
     def _describe_later(self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor) -> None:
         with self._scheduling:

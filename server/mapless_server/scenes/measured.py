@@ -1,5 +1,6 @@
 """The depths that sensors measured with references, at their keypoints."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from mapless_server.cache import LruCache
@@ -20,9 +21,12 @@ class MeasuredDepths:
         self._store = store
         self._cache: LruCache[KeypointDepths] = LruCache(_CACHE_BYTES)
 
-    def with_depth(self, record: ReferenceRecord, reference: PosedView, extractor: str) -> PosedView:
+    def with_depth(
+        self, record: ReferenceRecord, reference: PosedView, extractor: str, is_metric: Callable[[], bool]
+    ) -> PosedView:
         """The reference with its depth at the keypoints of an extractor; unchanged without depth.
 
+        A depth whose median is that of another unit than metres is not used where the scene's unit is the metre.
         NotFound if the reference was deleted, DataLoss if its depth is damaged.
         """
         if not record.depth_sha256:
@@ -31,7 +35,7 @@ class MeasuredDepths:
         if found is None:
             found = read_measured(self._store, record).at_keypoints(reference.view)
             self._cache.put((record.key, extractor), found, found.depth.nbytes + found.relative_sigma.nbytes)
-        return replace(reference, depths=found)
+        return replace(reference, depths=found) if found.is_plausible or not is_metric() else reference
 
 
 def read_measured(store: Store, record: ReferenceRecord) -> MeasuredDepth:

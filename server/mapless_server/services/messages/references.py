@@ -126,7 +126,10 @@ def implausible_depths(medians: Mapping[str, float | None]) -> list[str]:
         return []
     first, depth = next(iter(wrong.items()))
     others = f", and those of {len(wrong) - 1} more are as far" if len(wrong) > 1 else ""
-    return [f"the median depth of reference {first!r} is {depth:.3g}{others}: is unit_m right, 0.001 for millimetres?"]
+    return [
+        f"the median depth of reference {first!r} is {depth:.3g}{others}, so it is not used: is unit_m right, 0.001 "
+        "for millimetres?"
+    ]
 
 
 def choice_to_message(choice: Choice, scene_id: str) -> pb.RetrieveReferencesResponse:
