@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.commands import run
 from support.images import encode, textured
 from support.scenes import CAMERA
 
@@ -79,3 +80,14 @@ def test_a_number_that_is_null_is_missing(tmp_path: Path) -> None:
     entry = {"depth": "depth/1.f32", "depth_width": None, "depth_height": None, "depth_min_confidence": None}
     found = depth_of(tmp_path, entry, ALL)
     assert (found.size, found.min_confidence) == ((CAMERA.width_px, CAMERA.height_px), 1)
+
+
+def test_a_dry_run_names_depth_that_a_server_would_refuse(tmp_path: Path) -> None:
+    """A wrong depth of our own layout refuses its photograph; --no-depth imports that without it."""
+    dataset = read(tmp_path, {"depth": "depth/1.png"}, ALL)
+    file = tmp_path / "depth" / "1.png"
+    file.write_bytes(file.read_bytes()[:-20])
+    done = run("import", tmp_path, "nowhere", "--dry-run", "--skip-check")
+    assert (done.exit_code, "the PNG is cut off" in done.output) == (1, True), done.output
+    assert len(dataset.frames) == 1
+    assert run("import", tmp_path, "nowhere", "--dry-run", "--skip-check", "--no-depth").exit_code == 0

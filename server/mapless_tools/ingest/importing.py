@@ -11,7 +11,7 @@ from rich.console import Console
 from mapless import Client, MaplessError, Reference
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
-from mapless_server.images import ImageLimits
+from mapless_server.images import ImageLimits, decode_depth
 from mapless_server.method.pairs.readings.depth import implausible_depth
 from mapless_server.method.pairs.readings.verdict import Verdict
 from mapless_server.scenes.plausibility import another_unit, contradictions
@@ -194,20 +194,24 @@ def leave_same_poses(report: ImportReport, verdict: Verdict) -> None:
 
 
 def refuse_wrong_images(report: ImportReport) -> None:
-    """Refuses the chosen frames whose image, by its header, or mask a server would reject; for a dry run."""
+    """Refuses the chosen frames whose image, by its header, mask or depth a server would reject; for a dry run."""
     faults = [(frame.name, _fault_of_files(frame)) for frame in report.chosen]
     report.refused += [Refusal(name, fault) for name, fault in faults if fault]
 
 
 def _fault_of_files(frame: Frame) -> str:
-    """Why a frame's image or mask is wrong; empty if both are right."""
+    """Why a frame's image, mask or depth is wrong; empty if all are right."""
+    file = frame.mask_path
     try:
-        read_item(frame, ImageLimits())
+        new, _ = read_item(frame, ImageLimits())
         frame.read_ignored()
+        if frame.depth is not None and new.depth is not None:
+            file = frame.depth.path
+            decode_depth(new.depth, (frame.camera.width_px, frame.camera.height_px), ImageLimits())
     except ValueError as error:
         return str(error)
     except (OSError, InvalidArgument) as error:
-        return f"{frame.mask_path}: {error}"
+        return f"{file}: {error}"
     return ""
 
 
