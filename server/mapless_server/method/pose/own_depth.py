@@ -30,7 +30,7 @@ from mapless.geometry import Array
 
 from ..bundle.estimate import DepthCheck, PosedSupport, PoseEstimate
 from ..bundle.pose_problem import DRIFT_INFLATION, USUAL_DRIFT
-from ..bundle.priors import LIKELY_PROBABILITY, MIN_RELATIVE_INFORMATION, conflict_threshold, sharpened
+from ..bundle.priors import LIKELY_PROBABILITY, conflict_threshold, sharpened
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import cauchy_weight, moved, solve_columns, symmetric_products
@@ -155,7 +155,7 @@ def _checked(estimate: PoseEstimate, comparison: DepthComparison) -> PoseEstimat
 
 
 def improved(support: PosedSupport) -> PosedSupport:
-    """As `checked`, with the pose improved by the depths, unless they contradict it or add next to nothing."""
+    """As `checked`, with the pose improved by depths that do not contradict it and know more of it than its matches."""
     comparison = compare_depths(support)
     if comparison is None:
         return support
@@ -180,7 +180,7 @@ def _improved(estimate: PoseEstimate, comparison: DepthComparison) -> PoseEstima
         return estimate
     gradient, information = comparison.gradient_and_information(estimate.covariance)
     gain = float(np.abs(np.linalg.eigvals(information @ estimate.covariance)).max())
-    if not gain >= MIN_RELATIVE_INFORMATION:
+    if not gain >= 1:
         return estimate
     covariance = sharpened(estimate.covariance, information)
     return replace(
