@@ -95,7 +95,7 @@ class Found:
         support: support with the estimate; its points have their depths.
         score: the larger, the less likely are so many inliers among wrong matches.
         moved_score: the same for those matches that are at other pixels than in the reference; see `judge.references`.
-        own_covariance: (6, 6) the estimate's without the error that all depths share.
+        own_covariance: (6, 6) by the errors that the matches show: without those that depths share, or may have.
         excess: ratio of the depths' errors, by the residuals, to those stated; at least 1.
     """
 
@@ -133,9 +133,12 @@ def solve_by_depths(
     pose = solved.world_from_camera
     nearest = int(np.bincount(view[solved.inliers], minlength=len(references)).argmax())
     centre = references[nearest].world_from_camera.translation
-    covariance = own = _covariance(problem, solved) + _reference_covariance(problem, solved, centre)
+    covariance = _covariance(problem, solved) + _reference_covariance(problem, solved, centre)
     if problem.turned is None or len(problem.turned) < len(view):
-        covariance = own + scale_covariance(pose, centre, depths[nearest].common_sigma)
+        covariance += scale_covariance(pose, centre, depths[nearest].common_sigma)
+    _, shown_sigma = _noise(_linearize(problem, pose, solved.log_factor), solved.inliers, None)
+    as_shown = replace(solved, depth_sigma=min(solved.depth_sigma, shown_sigma))
+    own = _covariance(problem, as_shown) + _reference_covariance(problem, solved, centre)
     if problem.turned is not None:
         covariance = covariance + _factor_covariance(problem, solved)
     estimate = PoseEstimate(pose, PoseStage.REFINED, solved.inliers, solved.errors_px, covariance)
