@@ -6,7 +6,7 @@ from mapless_server.scenes.depth_checks import DepthCheck, depth_warnings
 
 
 def check(*neighbours: str, mistake: str = "", doubt: str = "") -> DepthCheck:
-    return DepthCheck(DepthVerdict(100, 50, mistake=mistake, doubt=doubt), neighbours)
+    return DepthCheck("key", DepthVerdict(100, 50, mistake=mistake, doubt=doubt), neighbours)
 
 
 def test_a_wrong_depth_explains_the_doubts_of_its_neighbours() -> None:

@@ -47,6 +47,11 @@ def test_a_wrong_depth_is_warned_of_and_found_by_the_audit(tmp_path: Path) -> No
         wrong = {name: it for name, it in audits.items() if it.verdict == "WRONG_DEPTH"}
         assert list(wrong) == [chosen[2].name]
         assert wrong[chosen[2].name].message.startswith(f"its depth: {MISTAKE}")
+        client.delete_reference("room", chosen[2].name)
+        assert client.get_scene("room").warnings == ()
+        again = NewReference(chosen[2].name, chosen[2].data, chosen[2].camera, chosen[2].world_from_camera)
+        client.add_reference("room", replace(again, depth=depths[chosen[2].name]))
+        assert client.get_scene("room").warnings == (warning,)
         client.update_scene("room", arbitrary_unit=True)
         assert not any("depth" in it for it in client.get_scene("room").warnings)
         assert "WRONG_DEPTH" not in {it.verdict for it in client.audit_scene("room")}

@@ -36,8 +36,9 @@ _CACHED_VERDICTS, _CACHED_BYTES = 10_000, 32 * 2**20
 
 @dataclass(frozen=True)
 class DepthCheck:
-    """The verdict on the depth of a reference, and the ids of the neighbours that it was compared with."""
+    """The key of a reference, the verdict on its depth, and the ids of the neighbours that it was compared with."""
 
+    key: str
     verdict: DepthVerdict
     neighbours: tuple[str, ...]
 
@@ -117,7 +118,7 @@ class DepthChecks:
                 parts.append(depths_of_neighbour(subject, other, depth, next_place, count))
                 next_place += len(parts[-1])
         verdict = judge_depth(subject, self._depth(scene_key, subject), SeenDepths.of(parts), bool(overlapping))
-        return DepthCheck(verdict, tuple(_id_of(it) for it in overlapping or others))
+        return DepthCheck(subject.key, verdict, tuple(_id_of(it) for it in overlapping or others))
 
     def _matches(self, subject: PosedView, other: PosedView) -> Matches:
         """Matches (M, 2) of keypoints that agree with both poses."""

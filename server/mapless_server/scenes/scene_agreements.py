@@ -103,6 +103,11 @@ class _Known:
     depths_generation: int = -1
     update: "Future[None] | None" = None
 
+    @property
+    def depth_warnings(self) -> tuple[str, ...]:
+        """Sentences about its depths."""
+        return tuple(depth_warnings({it: found for it, (found, _) in self.depths.items()}))
+
 
 class SceneAgreements:
     """The agreement of the scenes of a store; thread-safe. What takes long is computed in a thread of its own."""
@@ -179,6 +184,9 @@ class SceneAgreements:
                 for pair in [it for it in known.errors_px if not gone.isdisjoint(it)]:
                     del known.errors_px[pair]
                 known.sampled -= gone
+                known.depths = {it: found for it, found in known.depths.items() if found[0].key not in gone}
+                if known.agreement is not None:
+                    known.agreement = replace(known.agreement, depths=known.depth_warnings)
                 known.rests_until_s = -math.inf
 
     def forget_scene(self, scene_key: SceneKey) -> None:
@@ -269,7 +277,8 @@ class SceneAgreements:
             if before is None or before.is_alarm or len(wanted) >= KNOWN_GROWTH * count:
                 found = self._depths.check(scene_key, reference_id, self._check)
                 if found is not None:
-                    known.depths[reference_id] = found, len(wanted)
+                    with self._guard:  # a new dictionary, for others may read the old one
+                        known.depths = {**known.depths, reference_id: (found, len(wanted))}
         else:
             known.depths_generation = generation
         with self._guard:
@@ -312,7 +321,7 @@ class SceneAgreements:
             found = replace(found, explanation=before.explanation)
         if found.agreeing_count and found.median_depth is None:
             found = replace(found, median_depth=before.median_depth)
-        found = replace(found, depths=tuple(depth_warnings({it: found for it, (found, _) in known.depths.items()})))
+        found = replace(found, depths=known.depth_warnings)
         new = [it for it in found.depths if it not in before.depths]
         with self._guard:
             known.agreement = found

@@ -141,7 +141,8 @@ def judge_depth(
     text, own_sigmas = compared.misread() if are_poses_right else ("", np.inf)
     # The factor of an image that is misread says nothing.
     mistake = text if text and own_sigmas >= OWN_SIGMAS else factor_mistake
-    doubt = text if text and abs(own_sigmas) < OWN_SIGMAS else factor_doubt
+    is_doubtful = abs(own_sigmas) < OWN_SIGMAS and compared.share_of_all(0) < FITTING_SHARE
+    doubt = text if text and is_doubtful else factor_doubt
     return replace(verdict, mistake=mistake, doubt="" if mistake else doubt)
 
 
@@ -257,18 +258,18 @@ class _Compared:
         found = [it for it in self._gains() if is_significant(it[1], tested=len(READINGS) - 1)]
         named = [it for it in found if not READINGS[it[0]].is_flat and self._least_share(it[0]) >= FITTING_SHARE]
         if named:
-            row, _, own_sigmas = max(named, key=lambda it: (self._share_of_all(it[0]), it[1]))
+            row, _, own_sigmas = max(named, key=lambda it: (self.share_of_all(it[0]), it[1]))
             return self._text(row), own_sigmas
         count, share = self.agreeing(0)
-        if found and count >= MIN_PLACES and max(share, self._share_of_all(0)) < FITTING_SHARE:
+        if found and count >= MIN_PLACES and max(share, self.share_of_all(0)) < FITTING_SHARE:
             text = f"it does not fit the photograph, as another one's: {100 * share:.0f} % of {count} points agree"
             return text, max(own_sigmas for _, _, own_sigmas in found)
         return "", np.inf
 
     def _least_share(self, row: int) -> float:
-        return float(np.fmin(self.agreeing(row)[1], self._share_of_all(row)))
+        return float(np.fmin(self.agreeing(row)[1], self.share_of_all(row)))
 
-    def _share_of_all(self, row: int) -> float:
+    def share_of_all(self, row: int) -> float:
         """Share of the places with a depth under a reading that agree; 0 without any."""
         residual = self.residual[row][np.isfinite(self.residual[row]) & ~self._may_be_hidden[row]]
         return float(np.mean(np.abs(residual) <= AGREEING_SIGMA)) if len(residual) else 0.0
