@@ -50,6 +50,10 @@ LEAST_DAMPING = 1e-9
 """Relative damping that moves no solution, and leaves what observations do not determine with no information."""
 
 
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+
 def perturbed(target_from_source: RigidTransform, step: Array) -> RigidTransform:
     """The pose after a left perturbation (v, w) (6,): a rotation by w about the target's origin, then a shift by v."""
     rotation = rotation_from_vector(step[3:])

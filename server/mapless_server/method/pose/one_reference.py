@@ -32,6 +32,7 @@ from ..bundle.pose_problem import DRIFT_INFLATION, OWN_INFLATION, USUAL_DRIFT, U
 from ..features.tracks import Tracks
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import (
+    MAD_TO_SIGMA,
     cauchy_weight,
     motion_jacobian,
     perturbed,
@@ -45,9 +46,6 @@ from ..structure.model import DepthPlanes, PixelPoints, PointMatches, Structure
 from ..structure.observations import FIRST_GUESS
 from .pnp import MIN_MATCHES, PnpOptions, false_alarms, ransac
 from .turned import BEHIND_PX, Rows, TurnedMatches
-
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 FIRST_SIGMA_PX, MIN_SIGMA_PX = 1.5, 0.5
 """Initial and least standard deviation of a keypoint."""

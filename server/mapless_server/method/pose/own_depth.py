@@ -33,12 +33,12 @@ from ..bundle.pose_problem import DRIFT_INFLATION, USUAL_DRIFT
 from ..bundle.priors import LIKELY_PROBABILITY, conflict_threshold, sharpened
 from ..features.tracks import Tracks
 from ..features.views import PosedView
-from ..optim.optimize import cauchy_weight, moved, solve_columns, symmetric_products
+from ..optim.optimize import MAD_TO_SIGMA, cauchy_weight, moved, solve_columns, symmetric_products
 from ..structure.depth_mistakes import FITTING_SHARE
 from ..structure.kept_depth import REGIONS
 from ..structure.model import Structure
 from ..structure.structure import observe
-from .one_reference import INLIER_SIGMA, ITERATIONS, MAD_TO_SIGMA, MIN_INLIERS
+from .one_reference import INLIER_SIGMA, ITERATIONS, MIN_INLIERS
 from .pnp import LN_10
 
 

@@ -29,6 +29,7 @@ from mapless.geometry import Array
 from ..features.views import PosedView
 from ..optim.optimize import cauchy_weight
 from ..significance import is_significant, sigmas_of_gains
+from .kept_depth import AGREEING_SIGMA
 from .measured_depth import MeasuredDepth
 from .seen_depths import SeenDepths
 
@@ -36,8 +37,8 @@ MIN_PLACES = 24
 """Fewer places say nothing, as of matches, nor does a group with fewer than half of them."""
 OWN_SIGMAS = 1.645
 """By so much the triangulated points alone must prefer another reading: 5 % of right depths do so by chance."""
-AGREEING_SIGMA, FITTING_SHARE = 3.0, 0.9
-"""A place agrees within so many standard deviations, and a reading is named if so many triangulated points agree."""
+FITTING_SHARE = 0.9
+"""A reading is named if so many triangulated points agree, within `AGREEING_SIGMA`."""
 SHIFT_SHARE, SHIFT_STEPS = 1 / 40, 3
 """Shifts that are tried: multiples of this share of the width, so many in each direction. Smaller ones are not seen."""
 ZOOMS = (0.8, 0.85, 0.9, 1.1, 1.15, 1.2)
@@ -45,7 +46,7 @@ ZOOMS = (0.8, 0.85, 0.9, 1.1, 1.15, 1.2)
 ERROR_SLOPE = 0.1
 """Standard deviation of the slowly changing error: over the image's width, and from the median depth to twice that."""
 REPEATED_SIGMA = 0.02
-"""Standard deviation of the factor between the depths of two references; `research.depth_mistakes` measures it."""
+"""Standard deviation of the factor between the depths of two references; of right depths of four recordings."""
 MIN_GROUP, MIN_GROUP_SHARE = 100, 0.8
 """Depths of a neighbour from which such a factor is known, and the share of them that agrees otherwise."""
 OUTLIER_SHARE = 0.1
@@ -55,6 +56,7 @@ ITERATIONS = 4
 LARGEST_COMMON = max(noise.common for sensor, noise in NOISE.items() if sensor is not DepthSensor.UNKNOWN)
 """Standard deviation of the factor of a sensor of unknown kind: the largest of the known kinds."""
 UNIT_FACTORS = {1000.0: "are these millimetres, with unit_m 1?", 0.001: "are these metres, with unit_m 0.001?"}
+"""The likely mistake of depths that are so many times as long as what others see."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +278,7 @@ class _Compared:
 
     def _gains(self) -> list[tuple[int, float, float]]:
         """What readings gain over the given one, in standard deviations, of all places and of triangulated ones."""
-        spread = max(0.1, float(np.std(np.log(self.seen.depth))))
+        spread = max(ERROR_SLOPE, float(np.std(np.log(self.seen.depth))))
         densities = _log_densities(self.residual, self.sigma, spread)
         gains = np.where(self._may_be_hidden, np.nan, densities - densities[0])
         _, place, counts = np.unique(self.seen.place, return_inverse=True, return_counts=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array
 
 from ..features.views import Matches, PosedView
+from ..optim.optimize import MAD_TO_SIGMA
 from ..pairs.epipolar import MIN_PARALLAX_DEG, PosedMatches, triangulate_depths
 from .measured_depth import MeasuredDepth
 
@@ -22,7 +23,7 @@ MAX_EPIPOLAR_PX, MAX_RELATIVE_SIGMA = 2.0, 0.2
 """Matches and triangulated points that are worse say nothing of a depth."""
 POSE_SIGMA_M = 0.003
 """Standard deviation of the distance between two references, metres: a triangulated depth is off by as large a share.
-`research.depth_mistakes` prints the factors of right depths by it."""
+Chosen so that right depths of four recordings fit."""
 MOST_POINTS, GRID = 150, 1200
 """Triangulated points of a neighbour that are compared, at most, and depths of all neighbours together: more take
 longer, and are not independent."""
@@ -74,7 +75,7 @@ class SeenDepths:
 def triangulated_depths(subject: PosedView, neighbour: PosedView, matches: Matches) -> SeenDepths:
     """Depths of the subject's keypoints, triangulated with one neighbour; the matches are (subject, neighbour).
 
-    With the parallax p and the standard deviation s of a ray's angle, that of a depth is sqrt(2) s / tan(p). The factor
+    With the parallax p and the standard deviation s of a ray's angle, that of a depth is sqrt(2) s / sin(p). The factor
     of all is off by the mean distance from the epipolar lines, as far as poses are as wrong along the lines as across
     them, and by the error of the distance between the cameras.
     """
@@ -87,8 +88,8 @@ def triangulated_depths(subject: PosedView, neighbour: PosedView, matches: Match
     near = np.abs(distance_px) <= MAX_EPIPOLAR_PX
     if posed.are_at_one_place[0] or not near.any():
         return _nothing()
-    px = max(KEYPOINT_PX, 1.4826 * float(np.median(np.abs(distance_px[near]))))
-    px_to_share = np.sqrt(2) / posed.focal.min() / np.tan(np.radians(np.clip(parallax_deg, 1e-3, 89.0)))
+    px = max(KEYPOINT_PX, MAD_TO_SIGMA * float(np.median(np.abs(distance_px[near]))))
+    px_to_share = np.sqrt(2) / posed.focal.min() / np.sin(np.radians(parallax_deg.clip(MIN_PARALLAX_DEG)))
     kept = near & (depth > 0).all(axis=1) & (parallax_deg >= MIN_PARALLAX_DEG)
     kept &= px * px_to_share <= MAX_RELATIVE_SIGMA
     if not kept.any():

@@ -17,7 +17,14 @@ from mapless.geometry import Array
 from mapless_server.method.bundle.intrinsics import corrected_view, keypoint_motion
 from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.features.views import Features, Matches, PosedView, View
-from mapless_server.method.optim.optimize import MinimizeOptions, cauchy_cost, cauchy_weight, damped_step, minimize
+from mapless_server.method.optim.optimize import (
+    MAD_TO_SIGMA,
+    MinimizeOptions,
+    cauchy_cost,
+    cauchy_weight,
+    damped_step,
+    minimize,
+)
 from mapless_server.method.pose.two_view_matches import TwoViewMatches
 
 SHARED = [0, 3]
@@ -102,7 +109,7 @@ def lens_contradiction(found: Sequence[SharedErrors]) -> SharedErrors | None:
         return None
     values, usual = np.array([it.value for it in found]), IntrinsicsSigma()
     middle = np.median(values, axis=0)
-    spread = 1.2533 * 1.4826 * np.median(np.abs(values - middle), axis=0) / np.sqrt(len(values))
+    spread = 1.2533 * MAD_TO_SIGMA * np.median(np.abs(values - middle), axis=0) / np.sqrt(len(values))
     sigma = np.maximum(spread, np.median([it.sigma for it in found], axis=0))
     contradicted = np.abs(middle) > SIGMAS * np.maximum(sigma, (usual.focal_share, usual.k1))
     return SharedErrors(np.where(contradicted, middle, 0.0), sigma) if contradicted.any() else None
