@@ -171,6 +171,9 @@ static int find_nearest(const Descriptors *first, const Descriptors *second, Py_
 }
 #endif
 
+/* Longer descriptors would overflow the sums of products, and sizes. */
+enum { LONGEST = 32768 };
+
 enum { FIRST, SECOND, FIRST_LENGTHS, SECOND_LENGTHS, NEAREST, BEST, SECOND_BEST, COLUMN_BEST, COLUMN_SECOND, BUFFERS };
 
 static PyObject *nearest(PyObject *Py_UNUSED(module), PyObject *arguments) {
@@ -181,7 +184,8 @@ static PyObject *nearest(PyObject *Py_UNUSED(module), PyObject *arguments) {
                           &b[7], &b[8]))
         return NULL;
     const Py_ssize_t rows = b[FIRST_LENGTHS].len / 4, columns = b[SECOND_LENGTHS].len / 4;
-    int fits = length > 0 && length % 4 == 0 && b[FIRST].len == rows * length && b[SECOND].len == columns * length;
+    int fits = length > 0 && length % 4 == 0 && length <= LONGEST;
+    fits = fits && b[FIRST].len == rows * length && b[SECOND].len == columns * length;
     for (int i = NEAREST; i < BUFFERS; i++) fits &= b[i].len == 4 * (i < COLUMN_BEST ? rows : columns);
     if (!fits || !HAS_VNNI) {
         PyErr_SetString(PyExc_ValueError, "the sizes of the arrays do not fit, or the processor has no VNNI");

@@ -57,8 +57,10 @@ def is_available(length: int) -> bool:
 def nearest(first: Whole, second: Whole) -> Nearest:
     """The nearest of each by (a b inverse_length_b) inverse_length_a, rounded as float32 in this order.
 
-    ValueError if the numbers of rows or their lengths do not fit, or it is not available.
+    ValueError if the numbers of rows or their lengths do not fit, or where it is not available.
     """
+    if not is_available(first.numbers.shape[1]):
+        raise ValueError(f"descriptors of {first.numbers.shape[1]} numbers are not compared by compiled code here")
     rows, columns = len(first.numbers), len(second.numbers)
     best, second_best = np.empty((2, rows), np.float32)
     best_of_column, second_of_column = np.empty((2, columns), np.float32)

@@ -11,7 +11,7 @@ import numpy as np
 from mapless import Client, Reference
 from mapless.masks import FOLDER as MASKS
 from mapless.masks import mask_name
-from mapless_server.images import ImageLimits, decode_depth
+from mapless_server.images import ANY_SIZE, decode_depth
 from mapless_tools.output_files import whole_file
 from mapless_tools.progress import Progress
 
@@ -81,7 +81,7 @@ def _write_depth(folder: Path, layout: Layout, image: str, reference: Reference)
         return None
     if layout.depths is DepthForm.METRES:
         path = f"{image}.depth"
-        values = decode_depth(depth, (reference.camera.width_px, reference.camera.height_px), ImageLimits())
+        values = decode_depth(depth, (reference.camera.width_px, reference.camera.height_px), ANY_SIZE)
         _write(folder / layout.images / path, np.nan_to_num(values).astype("<f4").tobytes())
         height, width = values.shape
         return WrittenDepth(path, replace(depth, data=b"", unit_m=1.0, size=(width, height), confidence=b""))

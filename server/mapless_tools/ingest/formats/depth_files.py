@@ -17,14 +17,16 @@ def decode_exr(data: bytes) -> tuple[bytes, tuple[int, int]]:
     from OpenEXR import File
 
     try:
-        (low, high) = File(BytesIO(data), header_only=True).header()["dataWindow"]
+        parts = File(BytesIO(data), header_only=True).parts
+        names = [channel.name for part in parts for channel in part.header["channels"]]
+        if len(names) != 1:  # before anything is inflated
+            raise ValueError(f"it has the channels {', '.join(names) or 'none'}, a depth has one")
+        (low, high) = parts[0].header["dataWindow"]
         width, height = (int(it) for it in high - low + 1)
         _check_size(width, height)
         channels = File(BytesIO(data), separate_channels=True).channels()
     except (RuntimeError, KeyError, ValueError) as error:
         raise ValueError(f"it is no EXR, or damaged: {error}") from error
-    if len(channels) != 1:
-        raise ValueError(f"it has the channels {', '.join(channels) or 'none'}, a depth has one")
     (channel,) = channels.values()
     values = np.asarray(channel.pixels)
     if values.shape != (height, width) or values.dtype.kind != "f":
@@ -48,7 +50,7 @@ def decode_npy(data: bytes) -> tuple[bytes, tuple[int, int]]:
 
 
 def _check_size(width: int, height: int) -> None:
-    if not 0 < width * height <= MAX_PIXELS:
+    if not (width > 0 < height and width * height <= MAX_PIXELS):
         raise ValueError(f"it has {width}x{height} pixels")
 
 

@@ -14,8 +14,6 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from mapless.depth import DepthSensor
 from mapless.geometry import Array, RigidTransform
 from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, named
@@ -111,9 +109,7 @@ def _depth_camera(collector: Collector, info: _Info) -> DepthFile | None:
     except ValueError as error:
         collector.leave_out_depth("all", error)
         return None
-    if np.array_equal(pose.matrix(), np.eye(4)):
-        pose = inverse.inverse()
-    return DepthFile(Path(), 0.001, DepthSensor.STRUCTURED_LIGHT, camera, pose)
+    return DepthFile(Path(), 0.001, DepthSensor.STRUCTURED_LIGHT, camera, inverse.inverse().compose(pose))
 
 
 def _depth(collector: Collector, path: str, of_room: DepthFile | None, size: tuple[int, int]) -> DepthFile | None:
