@@ -41,7 +41,7 @@ def test_a_short_campaign_finds_nothing(name: str, tmp_path: Path) -> None:
     log = (tmp_path / name / "log").read_text(errors="replace")
     assert outcome.findings == (), log[-3000:]
     assert outcome.exit_code == 0, log[-3000:]
-    assert outcome.inputs == RUNS
+    assert RUNS <= outcome.inputs < 1.1 * RUNS  # libFuzzer runs some twice
     assert outcome.accepted > 0
     assert outcome.edges > len(load(name).seeds())  # it is guided
 
