@@ -1,7 +1,8 @@
 """Depth images of references: what a message says of them, their bytes, and how they are kept.
 
 Laws: a refusal names a field of the depth; what is accepted has the size of its values, each of which is above 0 or
-unknown, and one at least is known; it comes back from the store and over the wire as it was.
+unknown, and one at least is known, with an error within bounds; it comes back from the store and over the wire as it
+was.
 """
 
 from __future__ import annotations
@@ -12,7 +13,15 @@ from random import Random
 import numpy as np
 from support.depths import png
 
-from mapless.depth import DepthImage, DepthNoise, DepthSensor, depth_from_message, depth_to_message
+from mapless.depth import (
+    LEAST_SIGMA,
+    MOST_SIGMA,
+    DepthImage,
+    DepthNoise,
+    DepthSensor,
+    depth_from_message,
+    depth_to_message,
+)
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless.v1 import geometry_pb2 as pb
 from mapless.wire import FieldError
@@ -50,15 +59,20 @@ def check(data: bytes) -> bool:
     assert values.dtype == np.float32
     assert values.size <= LIMITS.max_depth_pixels
     assert depth.size is None or depth.size == values.shape[::-1]
-    assert not (values <= 0).any()
-    assert not np.isnan(values).all()
+    known = values[~np.isnan(values)].astype(np.float64)
+    assert len(known)
+    assert (known > 0).all()
+    assert np.isfinite(known).all()
     assert decode_depth_image(encode_depth_image(depth), depth.sha256).sha256 == depth.sha256
     assert depth_from_message(depth_to_message(depth), FIELD).sha256 == depth.sha256
     if depth.camera is not None:
         check_received_camera(depth.camera)
     if depth.camera_from_depth_camera is not None:
         check_pose(depth.camera_from_depth_camera)
-    assert (depth.known_noise.sigma_m(np.array([1.0])) > 0).all()
+    assert depth.noise is None or depth.noise.bounded() == depth.noise
+    sigma = depth.known_noise.relative_sigma(known)
+    assert (sigma >= LEAST_SIGMA).all()
+    assert (sigma <= MOST_SIGMA).all()
     return True
 
 

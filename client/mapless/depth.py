@@ -21,6 +21,10 @@ MIN_UNIT_M, MAX_UNIT_M = 1e-6, 100.0
 """Bounds of the values of depth images."""
 PLAUSIBLE_DEPTHS = 0.05, 200.0
 """Bounds of the median depth of a photograph, metres: with others the unit is most likely wrong."""
+MAX_NOISE = {"constant_m": 1000.0, "linear": 1.0, "quadratic_per_m": 1000.0, "common": 1.0}
+"""Largest numbers of a `DepthNoise` that a server accepts."""
+LEAST_SIGMA, MOST_SIGMA = 1e-6, 1.0
+"""Bounds of the standard deviation of a depth, as a share, whose inverse square is then finite; `common` may be 0."""
 MAX_APART_M, MAX_TURNED_DEG = 1.0, 45.0
 """From a photograph's camera to its depth camera, and between their viewing directions."""
 
@@ -46,6 +50,7 @@ class DepthNoise:
         quadratic_per_m: share of the squared depth that is added, per metre.
         common: standard deviation of the factor that all depths of an image share, as a share.
 
+    A server accepts at most `MAX_NOISE`, and as `common` 0 or at least `LEAST_SIGMA`.
     ValueError if a number is negative or not finite, or the standard deviation is 0.
     """
 
@@ -64,6 +69,15 @@ class DepthNoise:
     def sigma_m(self, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Standard deviation of depths, metres."""
         return self.constant_m + self.linear * depth_m + self.quadratic_per_m * depth_m**2
+
+    def relative_sigma(self, depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Standard deviation of depths as a share of them, `LEAST_SIGMA` to `MOST_SIGMA`."""
+        return np.clip(self.sigma_m(depth_m) / depth_m, LEAST_SIGMA, MOST_SIGMA)
+
+    def bounded(self) -> "DepthNoise":
+        """The nearest noise that a server accepts: references may have been stored with any."""
+        noise = DepthNoise(**{name: min(value, MAX_NOISE[name]) for name, value in asdict(self).items()})
+        return replace(noise, common=max(noise.common, LEAST_SIGMA)) if noise.common else noise
 
 
 NOISE = {
@@ -249,8 +263,13 @@ def _extrinsics_from_message(message: pb.DepthImage, field: str) -> RigidTransfo
 
 
 def _noise_from_message(message: pb.DepthNoise, field: str) -> DepthNoise:
-    if not message.common <= 1:
-        raise FieldError(joined(field, "common"), f"must be 0 to 1, is {message.common:g}")
+    for name, most in MAX_NOISE.items():
+        value = getattr(message, name)
+        if not 0 <= value <= most:
+            raise FieldError(joined(field, name), f"must be 0 to {most:g}, is {value:g}")
+    if 0 < message.common < LEAST_SIGMA:
+        text = f"must be 0, or {LEAST_SIGMA:g} to {MAX_NOISE['common']:g}, is {message.common:g}"
+        raise FieldError(joined(field, "common"), text)
     try:
         return DepthNoise(message.constant_m, message.linear, message.quadratic_per_m, message.common)
     except ValueError as error:

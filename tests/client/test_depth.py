@@ -84,7 +84,19 @@ BAD = {
         "camera_from_depth_camera.rotation",
     ),
     "no noise": (pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise()), "noise"),
-    "negative noise": (pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise(linear=-1)), "noise"),
+    "negative noise": (pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise(linear=-1)), "noise.linear"),
+    "noise of kilometres": (
+        pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise(constant_m=1e300)),
+        "noise.constant_m",
+    ),
+    "noise of NaN": (
+        pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise(quadratic_per_m=float("nan"))),
+        "noise.quadratic_per_m",
+    ),
+    "an exact scale": (
+        pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise(linear=1, common=1e-160)),
+        "noise.common",
+    ),
     "a scale beyond 100 %": (
         pb.DepthImage(png=b"x", unit_m=1, noise=pb.DepthNoise(linear=1, common=2)),
         "noise.common",

@@ -41,6 +41,17 @@ def test_float32_values_may_be_nan_infinite_or_0_for_none() -> None:
     np.testing.assert_array_equal(np.isfinite(found[0, :4]), [False, False, False, True])
 
 
+@pytest.mark.parametrize(("unit_m", "value"), [(1e-6, 1e-45), (1e-6, 1e-35), (100.0, 3e38)])
+def test_a_value_whose_length_is_no_finite_number_is_none(unit_m: float, value: float) -> None:
+    metres = METRES.copy()
+    metres[0, 0] = value
+    found = decoded(replace(DepthImage.of_metres(metres), unit_m=unit_m))
+    assert np.isnan(found[0, 0])
+    assert np.isnan(found).sum() == 1
+    metres[:] = value
+    assert fault(replace(DepthImage.of_metres(metres), unit_m=unit_m)) == ("DEPTH_EMPTY", "")
+
+
 def test_depths_of_less_confidence_are_not_used() -> None:
     confidence = np.full(STEPS.shape, 2, np.uint8)
     confidence[0], confidence[1] = 0, 1

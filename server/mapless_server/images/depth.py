@@ -77,14 +77,17 @@ def decode_depth(
         if (values < 0).any():
             message = f"depths must not be below 0, the least is {np.nanmin(values):g}; is its camera's z backward?"
             raise InvalidArgument(message, reason="DEPTH_NEGATIVE", field=f"{field}.float32")
-        values = np.where(np.isfinite(values) & (values > 0), values, np.float32(np.nan))
+        values = values.copy()
     if depth.confidence:
         confidence = _decoded(depth.confidence, np.uint8, f"{field}.confidence")
         values[confidence < depth.min_confidence] = np.nan
+    with np.errstate(over="ignore", under="ignore"):
+        values *= np.float32(depth.unit_m)
+    # Of smaller ones the inverse is not finite.
+    values[~(np.isfinite(values) & (values >= np.finfo(np.float32).tiny))] = np.nan
     if np.isnan(values).all():
         message = "no pixel of the depth has a value that is used"
         raise InvalidArgument(message, reason="DEPTH_EMPTY", field=field)
-    values *= np.float32(depth.unit_m)
     return values
 
 

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import pytest
 from support.scenes import random_for
 
+from mapless.depth import MAX_NOISE, DepthNoise
 from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, Matches, PosedView, View
 from mapless_server.method.pairs.stationary import StationaryOptions
 from mapless_server.method.pose.one_reference import Found, MatchedDepths, solve_by_depths
+from mapless_server.method.pose.own_depth import compare_depths
 from mapless_server.method.rejection import Rejection
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -142,3 +145,39 @@ def test_radii_contain_the_factors_error() -> None:
 def test_wrong_matches_give_no_accepted_pose() -> None:
     result = planted(random_for(1), Errors(wrong_share=1.0)).solved()
     assert isinstance(result, Rejection) or result.score < 3
+
+
+NOISES = [
+    *(it for it in product((0.0, 1e-60, 1000.0), (0.0, 1.0), (0.0, 1000.0), (0.0, 1e-6, 1.0)) if any(it[:3])),
+    (1e300, 1e300, 1e300, 1e300),
+    (1e-60, 0.0, 0.0, 1e-160),
+]
+"""Bounds of what is accepted, and numbers that were accepted before: constant, linear, quadratic, common."""
+
+
+@pytest.mark.parametrize("numbers", NOISES, ids=str)
+@pytest.mark.parametrize("of_reference", [False, True], ids=["own", "reference"])
+def test_any_noise_gives_a_finite_pose(numbers: tuple[float, ...], of_reference: bool) -> None:
+    noise = DepthNoise(*numbers).bounded()
+    assert all(value <= MAX_NOISE[name] for name, value in vars(noise).items())
+    given = planted(random_for(2), Errors(), 2, 60)
+    assert given.query.depths is not None
+    depth = given.query.depths.depth.astype(np.float64)
+    sigma = np.hypot(noise.relative_sigma(depth), noise.common).astype(np.float32)
+    query = replace(given.query, depths=replace(given.query.depths, relative_sigma=sigma, common_sigma=noise.common))
+    its, unknown = given.matches[0], np.full(len(given.matches[1]), np.nan)
+    seen = given.references[0].world_from_camera.inverse().compose(given.world_from_query)
+    rays = CAMERA.rays(query.features.pixels())
+    of_first = seen.apply(rays / rays[:, 2:] * depth[:, None])[its[:, 1], 2]
+    known = MatchedDepths(of_first if of_reference else unknown, float(np.median(sigma)), noise.common)
+    depths = [known, MatchedDepths(unknown, None, 0.0)]
+    solved = solve_by_depths(query, given.references, given.matches, depths, None, np.zeros(3), StationaryOptions())
+    assert isinstance(solved, Found), solved
+    estimate = solved.support.estimate
+    assert np.isfinite(estimate.world_from_camera.matrix()).all()
+    assert np.isfinite(estimate.covariance).all()
+    assert np.linalg.eigvalsh(estimate.covariance)[0] > 0
+    comparison = compare_depths(solved.support)
+    assert comparison is not None
+    check = comparison.check(estimate.covariance)
+    assert np.isfinite([check.factor, check.factor_sigma, comparison.log10_chance(check)]).all()

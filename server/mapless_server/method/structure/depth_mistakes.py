@@ -203,7 +203,7 @@ class _Compared:
         for row, it in enumerate(READINGS):
             if it.is_flat:
                 read[row] = np.nanmedian(read[0]) if np.isfinite(read[0]).any() else np.nan
-        sigma = np.hypot(depth.noise.sigma_m(read) / read, seen.relative_sigma)
+        sigma = np.hypot(depth.noise.relative_sigma(read), seen.relative_sigma)
         width, height = subject.view.camera.width_px, subject.view.camera.height_px
         slopes = seen.pixel / (width, height) - 0.5
         nearness = seen.depth / np.median(seen.depth) - 1

@@ -48,12 +48,12 @@ class MeasuredDepth:
         """The decoded depths (H, W) of an image, measured with a photograph of this camera."""
         height, width = depth.shape
         camera = image.camera or photo.resized(width, height)
-        return MeasuredDepth(camera, depth, image.known_noise, image.camera_from_depth_camera)
+        return MeasuredDepth(camera, depth, image.known_noise.bounded(), image.camera_from_depth_camera)
 
     def at_keypoints(self, view: View) -> KeypointDepths:
         """The depths at the keypoints of the photograph, with their standard deviations."""
         depth = self.at_pixels(view.camera, view.features.pixels())
-        sigma = np.hypot(self.noise.sigma_m(depth) / depth, self.noise.common)
+        sigma = np.hypot(self.noise.relative_sigma(depth), self.noise.common)
         return KeypointDepths(
             depth.astype(np.float32), sigma.astype(np.float32), self.noise.common, DepthSource.MEASURED
         )
@@ -156,7 +156,7 @@ def _without_edges(patches: Array, noise: DepthNoise) -> Array:
     times the variance of one of them. An edge is beyond three standard deviations.
     """
     inverse, inner = 1 / patches, patches[:, 1:-1, 1:-1]
-    limit = 3 * np.sqrt(6) * noise.sigma_m(inner) / inner
+    limit = 3 * np.sqrt(6) * noise.relative_sigma(inner)
     across, down = inverse[:, 1:-1, 2:] + inverse[:, 1:-1, :-2], inverse[:, 2:, 1:-1] + inverse[:, :-2, 1:-1]
     bends = [np.abs(sums / inverse[:, 1:-1, 1:-1] - 2) > limit for sums in (across, down)]
     near_edge = sliding_window_view(bends[0] | bends[1], (3, 3), axis=(1, 2)).any(axis=(-2, -1))

@@ -124,7 +124,7 @@ def depths_of_neighbour(
     camera, in_front = subject.view.camera, x[:, 2] > 0
     pixel = camera.project(np.where(in_front[:, None], x, (0.0, 0.0, 1.0)))
     inside = in_front & ((pixel >= 0) & (pixel <= (camera.width_px - 1, camera.height_px - 1))).all(axis=1)
-    sigma = depth.noise.sigma_m(values[inside]) / values[inside]
+    sigma = depth.noise.relative_sigma(values[inside])
     places = first_place + np.arange(len(sigma))
     return SeenDepths(pixel[inside], places, x[inside, 2], sigma, np.zeros(len(sigma), np.intp), np.array([np.inf]))
 
