@@ -142,6 +142,32 @@ def test_radii_contain_the_factors_error() -> None:
     assert in_95 >= 0.9
 
 
+@pytest.mark.parametrize("with_depth", [60, 80])
+def test_radii_contain_the_factor_of_some_references(with_depth: int) -> None:
+    """Of two references at a place one has depths, whose factor is much better known than the photograph's own."""
+    inside = []
+    for seed in range(60):
+        random = random_for("some references", seed)
+        factor, own_factor = np.exp(0.05 * random.normal()), np.exp(0.3 * random.normal())
+        given = planted(random, Errors(factor=float(own_factor), common_sigma=0.3, wrong_share=0.0), 1, 140)
+        (there,), (matches,), query = given.references, given.matches, given.query
+        assert query.depths is not None
+        rays = CAMERA.rays(query.features.pixels())
+        x = given.world_from_query.apply(rays / rays[:, 2:] * (query.depths.depth / own_factor)[:, None])
+        depth = there.world_from_camera.inverse().apply(x)[:, 2] * factor * np.exp(0.01 * random.normal(size=len(x)))
+        parts = np.split(random.permutation(matches), [with_depth])
+        known = MatchedDepths(depth[parts[0][:, 1]], 0.01, 0.05)
+        unknown = MatchedDepths(np.full(len(parts[1]), np.nan), None, 0.0)
+        result = solve_by_depths(query, [there, there], parts, [known, unknown], None, np.zeros(3), StationaryOptions())
+        assert isinstance(result, Found)
+        radii = accuracy_from_covariance(result.support.estimate.covariance)
+        off_m = given.off_m(result)
+        inside.append((off_m <= radii.position_68_m, off_m <= radii.position_95_m))
+    in_68, in_95 = np.mean(inside, axis=0)
+    assert 0.58 <= in_68 <= 0.9
+    assert in_95 >= 0.9
+
+
 def test_wrong_matches_give_no_accepted_pose() -> None:
     result = planted(random_for(1), Errors(wrong_share=1.0)).solved()
     assert isinstance(result, Rejection) or result.score < 3

@@ -132,13 +132,13 @@ def solve_by_depths(
     nearest = int(np.bincount(view[solved.inliers], minlength=len(references)).argmax())
     centre = references[nearest].world_from_camera.translation
     covariance = _covariance(problem, solved) + _reference_covariance(problem, solved, centre)
-    if problem.turned is None or len(problem.turned) < len(view):
+    if problem.turned is None:
         covariance += scale_covariance(pose, centre, depths[nearest].common_sigma)
+    else:
+        covariance += _factor_covariance(problem, problem.turned, solved, [it.common_sigma for it in depths])
     _, shown_sigma = _noise(_linearize(problem, pose, solved.log_factor), solved.inliers, None)
     as_shown = replace(solved, depth_sigma=min(solved.depth_sigma, shown_sigma))
     own = _covariance(problem, as_shown) + _reference_covariance(problem, solved, centre)
-    if problem.turned is not None:
-        covariance = covariance + _factor_covariance(problem, solved)
     estimate = PoseEstimate(pose, PoseStage.REFINED, solved.inliers, solved.errors_px, covariance)
     rows = np.arange(len(matches))
     structure = Structure(
@@ -376,21 +376,36 @@ def _shared(solved: _Solved) -> float:
 
 def _hessian(problem: _Problem, solved: _Solved) -> Array:
     """The information (U, U) of the inliers."""
-    rows = _linearize(problem, solved.world_from_camera, solved.log_factor)
-    information = rows.information(solved.sigma_px, solved.depth_sigma) * solved.inliers[:, None, None]
+    rows, information = _inlier_rows(problem, solved)
     return np.asarray(np.einsum("mia,mij,mjb->ab", rows.by_pose, information, rows.by_pose))
 
 
-def _factor_covariance(problem: _Problem, solved: _Solved) -> Array:
-    """Part (6, 6) of the covariance in the world by the factor of the query's depths; 0 if none are used."""
-    if problem.turned is None:
-        return np.zeros((6, 6))
-    hessian = _hessian(problem, solved)
+def _inlier_rows(problem: _Problem, solved: _Solved) -> tuple[Rows, Array]:
+    """The residuals at a pose, and the information (M, 2, 2) of each; 0 if it is no inlier."""
+    rows = _linearize(problem, solved.world_from_camera, solved.log_factor)
+    return rows, rows.information(solved.sigma_px, solved.depth_sigma) * solved.inliers[:, None, None]
+
+
+def _factor_covariance(
+    problem: _Problem, turned: TurnedMatches, solved: _Solved, reference_sigmas: Sequence[float]
+) -> Array:
+    """Part (6, 6) of the covariance in the world by the factors of the query's depths, and of the references'.
+
+    Those of the references, with these standard deviations (K,), are no unknowns. They have one sensor (see
+    `kept_depth`), so they move the pose, and the query's factor within its prior, together.
+    """
+    (rows, information), hessian = _inlier_rows(problem, solved), _hessian(problem, solved)
     motion = -np.linalg.pinv(hessian[:6, :6], hermitian=True) @ hessian[:6, 6]
     of_factor = max(0.0, float(hessian[6, 6] + hessian[6, :6] @ motion)) / _shared(solved)
-    moved = world_jacobian(solved.world_from_camera) @ motion
-    common_sigma = _excess(problem, solved) * problem.turned.common_sigma
-    return np.asarray(np.outer(moved, moved) / (of_factor + common_sigma**-2))
+    of_factor += (_excess(problem, solved) * turned.common_sigma) ** -2
+    shares = np.where(np.arange(len(problem.view)) < len(problem.seen), np.take(reference_sigmas, problem.view), 0.0)
+    gradient = np.einsum("mia,mij,mj->a", rows.by_pose, information, rows.by_depth * shares[:, None])
+    hessian[6, 6] += turned.common_sigma**-2
+    by_references = -np.linalg.pinv(hessian, hermitian=True) @ gradient
+    moved = world_jacobian(solved.world_from_camera) @ np.stack(
+        [motion / np.sqrt(of_factor), by_references[:6]], axis=1
+    )
+    return np.asarray(moved @ moved.T)
 
 
 def _excess(problem: _Problem, solved: _Solved) -> float:
