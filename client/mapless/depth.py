@@ -29,6 +29,18 @@ MAX_APART_M, MAX_TURNED_DEG = 1.0, 45.0
 """From a photograph's camera to its depth camera, and between their viewing directions."""
 
 
+def implausible_median(median_m: float) -> str:
+    """The median depth of an image with the bounds that it is outside of, as it cannot be metres; empty if it can be.
+
+    NaN, the median of an image without any depth, can be.
+    """
+    least, most = PLAUSIBLE_DEPTHS
+    if not (median_m < least or median_m > most):
+        return ""
+    number = np.format_float_positional(median_m, 4, fractional=False, trim="-")
+    return f"{number} m, outside {least:g} to {most:g} m"
+
+
 class DepthSensor(str, Enum):
     """Kinds of depth sensors, whose noise differs."""
 

@@ -67,7 +67,7 @@ def test_a_wrong_depth_stores_nothing(client: Client, scene: str, depth: DepthIm
 
 def test_millimetres_taken_for_metres_are_warned_of(client: Client, scene: str) -> None:
     warnings = client.add_reference(scene, new(replace(DEPTH, unit_m=1.0))).warnings
-    assert any("median depth of reference 'deep' is 1.5e+03" in it for it in warnings)
+    assert any("median depth of reference 'deep' is 1500 m, outside 0.05 to 200 m" in it for it in warnings)
 
 
 def test_no_depth_is_implausible_in_an_arbitrary_unit(client: Client, scene: str) -> None:

@@ -57,6 +57,29 @@ def test_a_wrong_depth_is_warned_of_and_found_by_the_audit(tmp_path: Path) -> No
         assert "WRONG_DEPTH" not in {it.verdict for it in client.audit_scene("room")}
 
 
+def test_millimetres_taken_for_metres_are_named_by_their_median_and_accuse_nobody(tmp_path: Path) -> None:
+    """They take no part in comparisons: the same is said of a reference alone, and nothing of its neighbours."""
+    chosen = room().references[:4]
+    depths = {it.name: replace(depth_of(it.name), sensor=DepthSensor.STRUCTURED_LIGHT) for it in chosen}
+    wrong = chosen[2].name
+    depths[wrong] = replace(depths[wrong], unit_m=1.0)
+    new = [NewReference(it.name, it.data, it.camera, it.world_from_camera, depth=depths[it.name]) for it in chosen]
+    with (
+        serving_really(tmp_path, features="sift", background_matching=False) as server,
+        Client(server.address) as client,
+    ):
+        for scene, references in (("room", new), ("alone", [new[2]])):
+            client.create_scene(scene)
+            client.add_references(scene, references)
+            (warning,) = client.get_scene(scene).warnings
+            assert warning.startswith(f"the depth of reference {wrong!r}: its median is ")
+            assert "m, outside 0.05 to 200 m, so it is not used: is unit_m right" in warning
+            found = {it.name.rpartition("/")[2]: it for it in client.audit_scene(scene)}
+            assert [name for name, it in found.items() if it.verdict == "WRONG_DEPTH"] == [wrong]
+            assert found[wrong].message.startswith("its depth: its median is ")
+            assert not any("depth" in it.message for name, it in found.items() if name != wrong)
+
+
 def test_a_depth_of_another_unit_gives_no_pose(tmp_path: Path) -> None:
     """One reference alone would place photographs a thousand times too far away."""
     reference = room().references[0]

@@ -2,12 +2,14 @@
 
 A reference with depth is compared with the references that look most similar, if they share matches that agree with
 their poses: by the points that it triangulates with them, and by their depths. If none shares enough, by their depths
-alone. See `method.structure.depth_mistakes`.
+alone. See `method.structure.depth_mistakes`. A depth whose median cannot be metres is wrong by that alone, and is
+compared with nothing.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from mapless.depth import implausible_median
 from mapless_server.cache import LruCache
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.features.extractors import FeatureExtractor
@@ -104,6 +106,9 @@ class DepthChecks:
     def _compared(
         self, scene_key: SceneKey, subject: PosedView, others: Sequence[PosedView], check: Callable[[], None]
     ) -> DepthCheck:
+        if text := implausible_median(self._depth(scene_key, subject).median):
+            text = f"its median is {text}, so it is not used: is unit_m right, 0.001 for millimetres?"
+            return DepthCheck(subject.key, DepthVerdict(mistake=text), ())
         matches = {}
         for other in others:
             check()
@@ -113,7 +118,7 @@ class DepthChecks:
         next_place = len(subject.view.features)
         for other in overlapping or others:
             parts.append(triangulated_depths(subject, other, matches[other.key]) if overlapping else SeenDepths.of([]))
-            if self._has_depth(scene_key, other):
+            if self._has_depth(scene_key, other) and not implausible_median(self._depth(scene_key, other).median):
                 depth, count = self._depth(scene_key, other), GRID // len(overlapping or others)
                 parts.append(depths_of_neighbour(subject, other, depth, next_place, count))
                 next_place += len(parts[-1])

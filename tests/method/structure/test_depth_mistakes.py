@@ -101,6 +101,14 @@ def test_the_factor_of_a_kind_is_allowed_and_a_larger_one_not() -> None:
     assert judged(measured(0, lambda it: it * np.float32(1.1), lax)).mistake == ""
 
 
+def test_a_reading_with_which_no_more_places_agree_is_not_named() -> None:
+    """The noise lets a shifted image fit, too, though less well."""
+    wide = measured(0, lambda it: np.pad(it, ((0, 0), (24, 0)), constant_values=np.nan)[:, :-24].astype(np.float32))
+    found = judged(replace(wide, noise=DepthNoise(constant_m=0.6)))
+    assert found.agreeing_share > 0.98
+    assert (found.mistake, found.doubt) == ("", "")
+
+
 def test_without_points_one_of_two_depths_is_in_doubt() -> None:
     wrong, right = measured(0, lambda it: it[:, ::-1]), measured(1)
     found = judged(wrong, right, has_matches=False)

@@ -259,6 +259,7 @@ class _Compared:
         """
         found = [it for it in self._gains() if is_significant(it[1], tested=len(READINGS) - 1)]
         named = [it for it in found if not READINGS[it[0]].is_flat and self._least_share(it[0]) >= FITTING_SHARE]
+        named = [it for it in named if self._is_better(it[0])]
         if named:
             row, _, own_sigmas = max(named, key=lambda it: (self.share_of_all(it[0]), it[1]))
             return self._text(row), own_sigmas
@@ -267,6 +268,25 @@ class _Compared:
             text = f"it does not fit the photograph, as another one's: {100 * share:.0f} % of {count} points agree"
             return text, max(own_sigmas for _, _, own_sigmas in found)
         return "", np.inf
+
+    def _agreeing_as_given_and(self, row: int, is_triangulated: bool = True) -> tuple[int, int, int]:
+        """Number of places with a depth as given and under a reading, and of those that agree with either.
+
+        Those that are triangulated, or all.
+        """
+        known = np.isfinite(self.residual[0]) & np.isfinite(self.residual[row]) & ~self._may_be_hidden[row]
+        if is_triangulated:
+            known &= self.seen.are_triangulated
+        given, read = (np.abs(self.residual[it, known]) <= AGREEING_SIGMA for it in (0, row))
+        return int(known.sum()), int(given.sum()), int(read.sum())
+
+    def _is_better(self, row: int) -> bool:
+        """Whether significantly more places agree with a reading than with the image as given."""
+        for is_triangulated in (True, False):
+            _, given, read = self._agreeing_as_given_and(row, is_triangulated)
+            if read - given > OWN_SIGMAS**2:  # of so many of which none prefers the given one
+                return True
+        return False
 
     def _least_share(self, row: int) -> float:
         return float(np.fmin(self.agreeing(row)[1], self.share_of_all(row)))
@@ -292,12 +312,19 @@ class _Compared:
         return found
 
     def _text(self, row: int) -> str:
-        (count, given), (_, share), reading = self.agreeing(0), self.agreeing(row), READINGS[row]
+        reading = READINGS[row]
         shift = (self.width_px * reading.shift).round().astype(int).tolist()
         what = f"shifted by about ({shift[0]}, {shift[1]}) of its pixels" if any(shift) else reading.text
+        count, given, read = self._agreeing_as_given_and(row)
         if not count:
             return f"it is {what}, by the depth of its neighbours"
-        return f"it is {what}: {100 * given:.0f} % of {count} points agree with it, {100 * share:.0f} % otherwise"
+        if read - given > OWN_SIGMAS**2:
+            return f"it is {what}: of {count} points {given} agree with it as it is, {read} without that mistake"
+        count, given, read = self._agreeing_as_given_and(row, is_triangulated=False)
+        return (
+            f"it is {what}: of {count} places that its neighbours show {given} agree with it as it is, {read} without "
+            "that mistake"
+        )
 
 
 def _log_densities(residual: Array, sigma: Array, spread: float) -> Array:

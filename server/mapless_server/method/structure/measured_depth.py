@@ -50,6 +50,12 @@ class MeasuredDepth:
         camera = image.camera or photo.resized(width, height)
         return MeasuredDepth(camera, depth, image.known_noise.bounded(), image.camera_from_depth_camera)
 
+    @property
+    def median(self) -> float:
+        """The median of all depths, in the unit of poses; NaN without any."""
+        known = self.depth[np.isfinite(self.depth)]
+        return float(np.median(known)) if len(known) else math.nan
+
     def at_keypoints(self, view: View) -> KeypointDepths:
         """The depths at the keypoints of the photograph, with their standard deviations."""
         depth = self.at_pixels(view.camera, view.features.pixels())

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from mapless import names, wire
-from mapless.depth import PLAUSIBLE_DEPTHS
+from mapless.depth import implausible_median
 from mapless.provenance import GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
 from mapless.scenes import (
     Calibration,
@@ -120,15 +120,15 @@ def nearly_ignored(shares: Mapping[str, float]) -> list[str]:
 
 def implausible_depths(medians: Mapping[str, float | None]) -> list[str]:
     """Warning about new references whose median depth is that of another unit; or none."""
-    least, most = PLAUSIBLE_DEPTHS
-    wrong = {name: depth for name, depth in medians.items() if depth is not None and not least <= depth <= most}
+    texts = {name: "" if depth is None else implausible_median(depth) for name, depth in medians.items()}
+    wrong = {name: text for name, text in texts.items() if text}
     if not wrong:
         return []
-    first, depth = next(iter(wrong.items()))
+    first, text = next(iter(wrong.items()))
     others = f", and those of {len(wrong) - 1} more are as far" if len(wrong) > 1 else ""
     return [
-        f"the median depth of reference {first!r} is {depth:.3g}{others}, so it is not used: is unit_m right, 0.001 "
-        "for millimetres?"
+        f"the median depth of reference {first!r} is {text}{others}, so it is not used: is unit_m right, "
+        "0.001 for millimetres?"
     ]
 
 
