@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with WaitingClient(parsed.address, connect_options(parsed)) as client, suggesting(client):
             sys.exit(parsed.run(client, parsed))
     except MaplessError as error:
-        print(f"mapless: {_source_of(error, parsed)}{error}", file=sys.stderr)
+        print(f"mapless: {_source_of(error, parsed)}{error}{_advice(error, parsed)}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
     except BrokenPipeError:  # the reader of our output has closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -59,14 +59,33 @@ def _show_warning(
 
 def _source_of(error: MaplessError, parsed: argparse.Namespace) -> str:
     """Returns the file with the wrong field of a request, "photo.jpg: "; empty if no single file has it."""
-    for part in (error.field or "").split("."):
+    parts = (error.field or "").split(".")
+    if "depth" in parts:
+        parts = parts[parts.index("depth") :]
+        sources = [f"depth.{part}" for part in parts[1:]]
+    else:
+        sources = parts
+    for part in [*sources, parts[0]]:
         source = getattr(parsed, _SOURCES.get(part, ""), None)
         if source is not None and Path(source).is_file():
             return f"{source}: "
     return ""
 
 
-_SOURCES = {"image": "photo", "intrinsics": "camera", "world_from_camera": "pose"}
+def _advice(error: MaplessError, parsed: argparse.Namespace) -> str:
+    """Returns the flag that is missing, "; give --depth-camera"; empty if none is."""
+    is_of_another = error.reason == "DEPTH_SIZE" and (error.field or "").endswith("depth.intrinsics")
+    return "; give --depth-camera" if is_of_another and getattr(parsed, "depth_camera", None) is None else ""
+
+
+_SOURCES = {
+    "image": "photo",
+    "intrinsics": "camera",
+    "world_from_camera": "pose",
+    "depth": "depth",
+    "depth.intrinsics": "depth_camera",
+    "depth.camera_from_depth_camera": "depth_pose",
+}
 """The argument that has a field of the requests."""
 
 

@@ -209,25 +209,30 @@ def image_file(folder: Path, image: str) -> Path:
     Paths written on Windows are read, too (see `with_slashes`), absolute ones that lead into the folder, those without
     an ending, and those whose ending has other cases than the file's (.JPG).
     """
-    image = _within(folder, with_slashes(folder, image))
-    file = folder / image
-    try:
-        found = file.is_file()
-    except OSError as error:  # a name that no file can have
-        raise ValueError(f"image: {image[:100]!r}: {error.strerror}") from error
-    if found:
-        return file
-    for other in _other_endings(image):
-        if os.path.isfile(folder / other):
-            return folder / other
-    raise ValueError(f"image: there is no file {file}")
+    with named("image"):
+        return _file_in(folder, image)
 
 
 def path_in(folder: Path, path: object) -> Path:
     """The file that a layout names beside an image, such as its depth; ValueError as `image_file`, or for no text."""
     if not isinstance(path, str) or not path:
         raise ValueError(f"must be a path, is {path!r}")
-    return image_file(folder, path)
+    return _file_in(folder, path)
+
+
+def _file_in(folder: Path, image: str) -> Path:
+    image = _within(folder, with_slashes(folder, image))
+    file = folder / image
+    try:
+        found = file.is_file()
+    except OSError as error:  # a name that no file can have
+        raise ValueError(f"{image[:100]!r}: {error.strerror}") from error
+    if found:
+        return file
+    for other in _other_endings(image):
+        if os.path.isfile(folder / other):
+            return folder / other
+    raise ValueError(f"there is no file {file}")
 
 
 def _within(folder: Path, image: str) -> str:
@@ -238,7 +243,7 @@ def _within(folder: Path, image: str) -> str:
             path = path.relative_to(root)
             break
     if path.is_absolute() or ".." in path.parts:
-        raise ValueError(f"image: {image!r} leads out of {folder}")
+        raise ValueError(f"{image!r} leads out of {folder}")
     return str(path)
 
 

@@ -11,6 +11,7 @@ from support.servers import CAMERA, PHOTO, make_scene, serving
 
 from mapless import Client
 from mapless.__main__ import main
+from mapless.cli.output import plain
 
 
 @pytest.fixture(scope="module")
@@ -51,3 +52,17 @@ def test_what_a_depth_is_not_of_is_said(
     wrong = [folder, *given[1:], "--depth", f"{folder}/depth.png"] if is_folder else [*given, "--depth-unit", "0.001"]
     assert code_of([*wrong, "--address", address]) != 0
     assert ("--depth is that of one photograph" if is_folder else "give --depth, too") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("camera", ["lidar.json", None])
+def test_a_depth_of_another_size_blames_its_own_camera(
+    address: str, given: list[str], capsys: pytest.CaptureFixture[str], camera: str | None
+) -> None:
+    folder = Path(given[0]).parent
+    (folder / "depth.png").write_bytes(png(np.full((40, 100), 1500, np.uint16)))
+    (folder / "lidar.json").write_text(json.dumps(plain(CAMERA)))
+    flags = [] if camera is None else ["--depth-camera", str(folder / camera)]
+    assert code_of([*given, "--depth", str(folder / "depth.png"), *flags, "--address", address]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"mapless: {folder / (camera or 'depth.png')}: DEPTH_SIZE: ")
+    assert error.endswith("; give --depth-camera\n") is (camera is None)

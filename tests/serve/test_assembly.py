@@ -1,12 +1,15 @@
 """Settings to tiers: what serves, and what is said where something is missing."""
 
 import logging
+import sys
 from pathlib import Path
 
 import pytest
 from support.programs import printed
 
-from mapless_server.method.features.extractors import make_extractor
+from mapless_command.installation import how_to_install
+from mapless_server.extras import install_hint
+from mapless_server.method.features.extractors import edgepoint2, make_extractor
 from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsMissing
@@ -91,6 +94,15 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
     (record,) = caplog.records
     assert record.getMessage().startswith("features auto: edgepoint2-l64 and sift; with aliked and aliked-")
     assert record.getMessage().endswith("run `mapless-server weights fetch aliked aliked-lightglue`")
+
+
+def test_without_any_runtime_a_cpu_asks_for_the_smaller_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(edgepoint2, "find_spec", lambda package: None)
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    monkeypatch.delitem(sys.modules, "mapless_server.networks.edgepoint2_onnx", raising=False)
+    with pytest.raises(ImportError) as raised:
+        edgepoint2.EdgePoint2Extractor("l64", tmp_path / "weights")
+    assert install_hint(raised.value).endswith(how_to_install("edgepoint2"))
 
 
 def test_features_named_in_the_settings_are_never_replaced(tmp_path: Path) -> None:

@@ -59,15 +59,19 @@ def test_another_camera_has_its_own_size_and_pose(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("entry", "field"),
     [
-        ({"depth": "depth/2.png"}, "depth:"),
+        ({"depth": "depth/2.png"}, "^(?!.*image:).*depth: there is no file"),
         ({"depth": 1}, "depth:"),
-        ({"depth": "depth/1.png", "depth_unit_m": None}, "depth_unit_m:"),
-        ({"depth": "depth/1.png", "depth_sensor": "sonar"}, "depth_sensor:"),
+        ({"depth": "depth/1.png", "depth_unit_m": None}, "depth_unit_m is missing: 0.001 for mill"),
+        ({"depth": "depth/1.png", "depth_unit_m": "mm"}, "depth_unit_m must be a number, is 'mm'"),
+        ({"depth": "depth/1.png", "depth_sensor": "sonar"}, "depth_sensor must be one of unknown, .*, is 'sonar'"),
         ({"depth": "depth/1.png", "depth_min_confidence": "much"}, "depth_min_confidence:"),
         ({"depth": "depth/1.f32", "depth_width": 80.5}, "depth_width:"),
         ({"depth": "depth/1.png", "depth_K": 5}, "depth_K:"),
         ({"depth": "depth/1.png", "camera_from_depth_camera": [1, 2]}, "camera_from_depth_camera:"),
-        ({"depth": "depth/1.png", "depth_noise": {"bias": 1}}, "depth_noise:"),
+        (
+            {"depth": "depth/1.png", "depth_noise": {"bias": 1}},
+            "depth_noise: must be an object of constant_m, linear, .*'bias'",
+        ),
     ],
     ids=lambda it: it if isinstance(it, str) else "",
 )

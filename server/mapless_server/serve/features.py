@@ -159,12 +159,12 @@ def _log_features(settings: Settings, present: Iterable[str], missing: _Missing)
     if not missing:
         log.info("features auto: %s", chosen)
         return
-    package = next((install_hint(it) for it in missing.values() if isinstance(it, ImportError)), "")
+    packages = "; ".join(dict.fromkeys(install_hint(it) for it in missing.values() if isinstance(it, ImportError)))
     log.info(
         "features auto: %s; with %s more photographs are localized where references are few or far apart: %s",
         chosen,
         " and ".join(missing),
-        package or f"run `mapless-server weights fetch {' '.join(missing)}`",
+        packages or f"run `mapless-server weights fetch {' '.join(missing)}`",
     )
 
 

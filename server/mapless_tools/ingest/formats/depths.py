@@ -8,7 +8,7 @@ where that is elsewhere, and ``depth_confidence`` (path of a PNG of 8 bits) with
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -45,20 +45,15 @@ def depth_of_frame(folder: Path, entry: Mapping[str, Any], beside: Mapping[str, 
     said = {**beside, **entry}
     with named("depth"):
         path = path_in(folder, entry["depth"])
-    with named("depth_unit_m"):
-        unit_m = float(finite_numbers(said.get("depth_unit_m"), "it", ()))
-    with named("depth_sensor"):
-        sensor = DepthSensor(said.get("depth_sensor", DepthSensor.UNKNOWN.value))
-    camera = _camera(said)
     return DepthFile(
         path,
-        unit_m,
-        sensor,
-        camera,
+        _unit_m(said),
+        _sensor(said),
+        _camera(said),
         _read(said, "camera_from_depth_camera", _pose),
         _read(said, "depth_confidence", lambda it: path_in(folder, it)),
         _integer(said, "depth_min_confidence", 1),
-        _read(said, "depth_noise", lambda it: DepthNoise(**it)),
+        _read(said, "depth_noise", _noise),
         _size(said, entry) if path.suffix == FLOAT32 else None,
     )
 
@@ -85,10 +80,30 @@ def _read(said: Mapping[str, Any], field: str, read: Callable[[Any], Any]) -> An
     if said.get(field) is None:
         return None
     with named(field):
-        try:
-            return read(said[field])
-        except TypeError as error:  # of numbers by other names
-            raise ValueError(str(error)) from error
+        return read(said[field])
+
+
+def _unit_m(said: Mapping[str, Any]) -> float:
+    value = said.get("depth_unit_m")
+    if value is None:
+        raise ValueError("depth_unit_m is missing: 0.001 for millimetres")
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"depth_unit_m must be a number, is {value!r}: 0.001 for millimetres")
+    return float(finite_numbers(value, "depth_unit_m", ()))
+
+
+def _sensor(said: Mapping[str, Any]) -> DepthSensor:
+    value, kinds = said.get("depth_sensor", DepthSensor.UNKNOWN.value), [it.value for it in DepthSensor]
+    if value not in kinds:
+        raise ValueError(f"depth_sensor must be one of {', '.join(kinds)}, is {value!r}")
+    return DepthSensor(value)
+
+
+def _noise(numbers: object) -> DepthNoise:
+    names = [it.name for it in fields(DepthNoise)]
+    if not isinstance(numbers, dict) or not numbers.keys() <= set(names):
+        raise ValueError(f"must be an object of {', '.join(names)}, is {numbers!r}")
+    return DepthNoise(**{name: float(finite_numbers(value, name, ())) for name, value in numbers.items()})
 
 
 def _pose(matrix: object) -> RigidTransform:

@@ -77,8 +77,11 @@ class EdgePoint2Extractor:
 
 
 def _network(variant: str, weights: Path, device: str) -> EdgePoint2Network:
-    """By ONNX Runtime on a CPU where it is installed, which loads sooner; else by torch."""
-    if device == "cpu" and find_spec("onnxruntime") and find_spec("onnx"):
+    """By ONNX Runtime on a CPU where it is installed, which loads sooner; else by torch.
+
+    Where neither is, ImportError names ONNX Runtime on a CPU: it is the smaller.
+    """
+    if device == "cpu" and (all(map(find_spec, ("onnxruntime", "onnx"))) or not find_spec("torch")):
         from mapless_server.networks.edgepoint2_onnx import OnnxEdgePoint2
 
         return OnnxEdgePoint2(variant, weights)
