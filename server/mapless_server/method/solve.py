@@ -16,7 +16,7 @@ from .bundle.pose_problem import AdjustInput
 from .features.views import DepthSource, Matches, PosedView, Reconstruction
 from .judge.answer import Answer, Localization
 from .judge.cameras import intrinsics_checks
-from .judge.evidence import votes_of
+from .judge.evidence import Votes, votes_of
 from .judge.hypothesis import Attempt, Doubt, Found, Solver, doubt_of, found_by
 from .judge.judge import (
     contradiction,
@@ -169,8 +169,9 @@ def _by_depths(
     if failure:
         return coarse.answer(Rejection(RejectionReason.GATE, failure), support)
     if len(prepared.references) > 1:
+        votes = Votes(found.carried_view, found.carried_keypoint, found.carried)
         with prepared.context.stage("judge"):
-            rejection = contradiction(support, votes_of(support), prepared.unit, estimate.covariance)
+            rejection = contradiction(support, votes, prepared.unit, estimate.covariance)
         if rejection:
             return coarse.answer(rejection, support)
     return coarse.answer(replace(Localization.of(estimate, trust), scale_source=source), support)

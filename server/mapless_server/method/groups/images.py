@@ -5,6 +5,10 @@ A photograph that was rejected alone still has matches, and those of the group t
 A point that one reference observes has its distance from a depth: the reference's, or the photograph's own at the pose
 that its own answer gives it. The group knows no errors that depths share, so each of n depths has n times the variance
 of these, besides its own: together they hold the scale no firmer than one.
+
+Points at the photograph's own depth are on the rays of their pixels at the pose of its own answer, wrong matches too,
+and so agree with that pose whatever it is. The group uses those of accepted answers, inliers only, and counts none of
+them as evidence: that is the answer's own, which the group has where the joint pose keeps its inliers.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import PosedSupport, Support, observers
+from ..bundle.pose_problem import AdjustOptions
 from ..bundle.priors import NO_PRIORS, IntrinsicsSigma, Priors
 from ..features.limits import INLIER_PX
 from ..judge.answer import Answer, Localization
@@ -28,6 +33,7 @@ from ..options import DoubtOptions
 from ..pairs.stationary import StationaryOptions
 from ..pose.generalized import CameraMatches
 from ..pose.pnp import MIN_MATCHES, failure_by_chance, log10_false_alarms
+from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection, RejectionReason
 from ..structure.match import MatchOptions, search
 from ..structure.model import DepthPlanes, PointMatches, ScaleSource, Structure
@@ -69,12 +75,14 @@ class MatchedImage(Support):
         match: see GroupImage.
         own_trust: trust in `own_pose` if depths give it, whose evidence needs no second reference; else 0.
         own_count: number of its inliers.
+        at_own_depth: (P,) which points have their distance from the photograph's own depth, at `own_pose`.
     """
 
     image: int
     own_pose: RigidTransform | None
     own_covariance: Array | None
     match: MatchOptions
+    at_own_depth: NDArray[np.bool_]
     own_trust: float = 0.0
     own_count: int = 0
 
@@ -120,6 +128,21 @@ class PosedImage:
         """Share of the image that the convex hull of the inliers covers."""
         return hull_share(self.source.query, self.matches, self.inliers)
 
+    def keeps_own_answer(self) -> bool:
+        """Whether the inliers of its own answer mostly agree with its pose in the group."""
+        return bool(self.inliers.sum() >= AdjustOptions.min_kept_share * self.source.own_count)
+
+    def without_own_depth(self) -> PosedImage:
+        """Without points at the photograph's own depth."""
+        source, kept = self.source, ~self.source.at_own_depth
+        if kept.all():
+            return self
+        structure, matches = _with_points(source.structure, source.matches, kept)
+        source = replace(source, structure=structure, matches=matches, at_own_depth=source.at_own_depth[kept])
+        rows = kept[self.matches.point]
+        _, matches = _with_points(self.source.structure, self.matches, kept)
+        return replace(self, source=source, matches=matches, inliers=self.inliers[rows], errors_px=self.errors_px[rows])
+
     def moved(self) -> PosedImage:
         """Without matches at the same pixels as in the references, see `judge.references`."""
         kept = moved_matches(replace(self.source, matches=self.matches), StationaryOptions())
@@ -131,11 +154,52 @@ class PosedImage:
 def matched_images_of(images: Sequence[GroupImage]) -> list[MatchedImage]:
     """Returns the photographs that have matches, in one world: that of the first one."""
     with_matches = [
-        (i, image, image.answer.support)
+        (i, image, support)
         for i, image in enumerate(images)
-        if image.answer.support is not None and len(image.answer.support.matches) and not _is_of_network(image.answer)
+        if (support := _support_of(image.answer)) is not None
+        and len(support.matches)
+        and not _is_of_network(image.answer)
     ]
     return [_matched_image(i, image, support, with_matches[0][2].origin) for i, image, support in with_matches]
+
+
+def _support_of(answer: Answer) -> Support | None:
+    """The support of an answer; of the points at the photograph's own depth those of an accepted answer's inliers."""
+    support = answer.support
+    if support is None or not (own := _at_own_depth(support)).any():
+        return support
+    kept = ~own
+    if isinstance(answer.outcome, Localization) and isinstance(support, PosedSupport):
+        kept[support.matches.point[support.estimate.inliers]] = True
+    rows = kept[support.matches.point]
+    structure, matches = _with_points(support.structure, support.matches, kept)
+    support = replace(support, structure=structure, matches=matches)
+    if not isinstance(support, PosedSupport):
+        return support
+    estimate = support.estimate
+    estimate = replace(estimate, inliers=estimate.inliers[rows], errors_px=estimate.errors_px[rows])
+    return replace(support, estimate=estimate)
+
+
+def _at_own_depth(support: Support) -> NDArray[np.bool_]:
+    """Mask (P,) of the points at the photograph's own depth: one reference observes them, and has no depth there."""
+    structure = support.structure
+    count = len(structure.x_in_world)
+    if support.query.depths is None:
+        return np.zeros(count, bool)
+    own = np.bincount(structure.tracks.point, minlength=count) < 2
+    return own if structure.planes is None else own & ~(structure.planes.information > 0)
+
+
+def _with_points(
+    structure: Structure, matches: PointMatches, points: NDArray[np.bool_]
+) -> tuple[Structure, PointMatches]:
+    """Selects some points (P,) of a structure, and the matches with them."""
+    planes = None if structure.planes is None else structure.planes[points]
+    matches = matches.select(points[matches.point])
+    matches = replace(matches, point=(np.cumsum(points) - 1)[matches.point])
+    structure = Structure(structure.x_in_world[points], structure.tracks.select(points), structure.noise, planes)
+    return structure, matches
 
 
 def _matched_image(index: int, image: GroupImage, support: Support, origin: Array) -> MatchedImage:
@@ -164,6 +228,7 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
         own_pose=own_pose,
         own_covariance=own_covariance,
         match=image.match,
+        at_own_depth=_at_own_depth(support),
         own_trust=own_trust,
         own_count=own_count,
     )
@@ -223,9 +288,15 @@ def group_gate_failure(matched: Sequence[PosedImage]) -> str | None:
     """Returns why the pose of a group fails the gate; None if it passes.
 
     `pnp.gate_failure` with sums over the photographs; besides, a share of the points must be found, over more than a
-    corner of the image.
+    corner of the image. Points at a photograph's own depth do not count; a pose that keeps the inliers of the answer
+    that they give has passed the gate of that.
     """
+    if any(it.source.at_own_depth.any() and it.source.own_trust and it.keeps_own_answer() for it in matched):
+        return None
+    matched = [it.without_own_depth() for it in matched]
     inlier_total = sum(int(it.inliers.sum()) for it in matched)
+    if inlier_total < MIN_INLIERS:
+        return f"{inlier_total} matches agree on a pose besides those at the photographs' own depth"
     count = f"{_agreeing(matched)} in {len(matched)} images agree on a pose"
     moved = [it.moved() for it in matched]
     unmoved_count = inlier_total - sum(int(it.inliers.sum()) for it in moved)

@@ -32,7 +32,6 @@ from ..pose.generalized import CameraMatches, rig_ransac
 from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection
 from .images import PosedImage
-from .problem import ADJUST
 
 
 def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[float, Rejection | None]:
@@ -41,14 +40,27 @@ def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[floa
     The photographs have joint poses, and together at least four inliers. The coverage is the share of right answers to
     accept, above 0 and at most 1.
     """
+    evidence = _evidence_of([it.without_own_depth() for it in matched])
+    by_depths = [it.source.own_trust for it in matched if it.keeps_own_answer()]
+    trust = max(trust_of(evidence, JudgeOptions()), *by_depths, 0.0)
+    return trust, disagreeing_references(supporters_of_group(matched)) or low_trust(evidence, trust, coverage)
+
+
+def _evidence_of(matched: Sequence[PosedImage]) -> Evidence:
+    """The evidence of all photographs together; the least there is with fewer than four inliers.
+
+    Points at a photograph's own depth do not count.
+    """
     sources = [it.source for it in matched]
-    inliers = [int(it.inliers.sum()) for it in matched]
+    inliers, match_count = [int(it.inliers.sum()) for it in matched], sum(len(it.matches) for it in matched)
+    if sum(inliers) < MIN_INLIERS:
+        return Evidence(sum(inliers), match_count, 0.0, 0.0, 0.0, 0.0, NO_AGREEMENT, NO_AGREEMENT)
     findable = [it.findable_count() for it in matched]
     expected = [expected_share(it.structure, it.references) for it in sources]
     distance_m = _distance_m(matched)
-    evidence = Evidence(
+    return Evidence(
         sum(inliers),
-        sum(len(it.matches) for it in matched),
+        match_count,
         min(1.0, sum(inliers) / max(1, sum(findable))),
         float(np.average(expected, weights=np.maximum(findable, 1))),
         min(1.0, sum(it.hull_share() for it in matched)),
@@ -56,11 +68,6 @@ def trust_of_group(matched: Sequence[PosedImage], coverage: float) -> tuple[floa
         _matches_apart(matched, distance_m),
         _references_apart(matched, distance_m),
     )
-    by_depths = [
-        it.source.own_trust for it in matched if it.inliers.sum() >= ADJUST.min_kept_share * it.source.own_count
-    ]
-    trust = max(trust_of(evidence, JudgeOptions()), *by_depths, 0.0)
-    return trust, disagreeing_references(supporters_of_group(matched)) or low_trust(evidence, trust, coverage)
 
 
 def supporters_of_group(matched: Sequence[PosedImage]) -> list[Supporters]:

@@ -95,13 +95,19 @@ class Found:
         moved_score: the same for those matches that are at other pixels than in the reference; see `judge.references`.
         own_covariance: (6, 6) by the errors that the matches show: without those that depths share, or may have.
         excess: ratio of the depths' errors, by the residuals, to those stated; at least 1.
+        carried: points of V matches, each by its own reference alone; those of several references may contradict.
+        carried_view: (V,) index of the reference of each.
+        carried_keypoint: (V,) index of the query's keypoint of each; several references may share it.
     """
 
     support: PosedSupport
     score: float
     moved_score: float
     own_covariance: Array
-    excess: float = 1.0
+    excess: float
+    carried: PixelPoints
+    carried_view: NDArray[np.intp]
+    carried_keypoint: NDArray[np.intp]
 
 
 def solve_by_depths(
@@ -155,7 +161,8 @@ def solve_by_depths(
         moved[view == i] = are_moved(query, reference, its, its, stationary)
     some = replace(solved, inliers=solved.inliers[moved], errors_px=solved.errors_px[moved])
     excess = _excess(problem, solved)
-    return Found(support, score_of(problem, solved), score_of(problem[moved], some), own, excess)
+    carried = _carried(query, references, query_matches, depths, solved.log_factor)
+    return Found(support, score_of(problem, solved), score_of(problem[moved], some), own, excess, *carried)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,19 +227,20 @@ def _problem_of(
 ) -> tuple[_Problem, NDArray[np.intp], Matches]:
     """The problem of the matches with a depth, with the index (M,) of each one's reference, and the matches (M, 2).
 
-    A keypoint has one point at most by depths of references, the first one's.
+    A keypoint has one point at most by depths of references: that of the reference with most matches with a depth.
     """
-    view = np.repeat(np.arange(len(references)), [len(it) for it in query_matches])
-    matches = np.concatenate(query_matches)
-    points = np.concatenate([_points(*it) for it in zip(references, depths, query_matches, strict=True)])
-    known = np.isfinite(points).all(axis=1)
+    view, matches, points = _all_points(references, query_matches, depths)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
     stated = [it.sigma for it in depths if it.sigma is not None]
     sigma = float(np.median(stated)) if len(stated) > 1 else next(iter(stated), None)
     centres = np.array([it.world_from_camera.translation for it in references])
     own = np.zeros_like(known)
     if query.depths is not None:
         own = ~known & np.isfinite(query.depths.depth[matches[:, 0]])
+    counts, keys = np.bincount(view[known], minlength=len(references)), [it.key for it in references]
+    rank = np.argsort(sorted(range(len(references)), key=lambda i: (-counts[i], keys[i])))
     at = np.flatnonzero(known)
+    at = at[np.argsort(rank[view[at]], kind="stable")]
     known[np.delete(at, np.unique(matches[at, 0], return_index=True)[1])] = False
     seen = PixelPoints(query.camera, points[known], query.features.pixels(matches[known, 0]))
     problem = _Problem(seen, centres[view[known]], sigma, view[known])
@@ -242,6 +250,37 @@ def _problem_of(
     sigma, view = turned.depth_sigma if sigma is None else sigma, np.concatenate([view[known], view[own]])
     problem = replace(problem, depth_sigma=sigma, view=view, turned=turned)
     return problem, view, np.concatenate([matches[known], matches[own]])
+
+
+def _all_points(
+    references: Sequence[PosedView], query_matches: Sequence[Matches], depths: Sequence[MatchedDepths]
+) -> tuple[NDArray[np.intp], Matches, Array]:
+    """All matches (V, 2), the index (V,) of each one's reference, and its point (V, 3) by the depth of that."""
+    view = np.repeat(np.arange(len(references)), [len(it) for it in query_matches])
+    points = np.concatenate([_points(*it) for it in zip(references, depths, query_matches, strict=True)])
+    return view, np.concatenate(query_matches), points
+
+
+def _carried(
+    query: View,
+    references: Sequence[PosedView],
+    query_matches: Sequence[Matches],
+    depths: Sequence[MatchedDepths],
+    log_factor: float,
+) -> tuple[PixelPoints, NDArray[np.intp], NDArray[np.intp]]:
+    """The matches carried to points by their own references alone, the reference (V,) and the keypoint (V,) of each.
+
+    With the query's depths a reference alone has a pose among these, and so the depths of its own keypoints.
+    """
+    view, matches, points = _all_points(references, query_matches, depths)
+    if query.depths is not None:
+        own = ~np.isfinite(points).all(axis=1) & np.isfinite(query.depths.depth[matches[:, 0]])
+        if own.any():
+            turned = TurnedMatches.of(query, query.depths, references, view[own], matches[own])
+            points[own] = turned.carried(log_factor)
+    known = np.isfinite(points).all(axis=1)
+    keypoint = matches[known, 0].astype(np.intp)
+    return PixelPoints(query.camera, points[known], query.features.pixels(keypoint)), view[known], keypoint
 
 
 def _points(reference: PosedView, depths: MatchedDepths, matches: Matches) -> Array:

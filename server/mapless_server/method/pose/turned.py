@@ -126,6 +126,23 @@ class TurnedMatches:
         by_pose = np.concatenate([-by_point @ motion_jacobian(x_in_query), by_depth[:, :, None]], axis=2)
         return Rows(residual, by_pose, by_depth, in_front)
 
+    def carried(self, log_factor: float) -> Array:
+        """The points (T, 3) in the world on the rays of the references, each posed alone; NaN where that fails.
+
+        Unlike `in_world` they depend on no pose of the query that several references give together.
+        """
+        points = np.full((len(self), 3), np.nan)
+        for i in np.unique(self.view):
+            own, reference = self.view == i, self.references[i]
+            x_in_query = math.exp(log_factor) * self.x_in_query[own]
+            pose = ransac(PixelPoints(reference.view.camera, x_in_query, self.pixels[own]), None, PnpOptions())
+            if pose is None:
+                continue
+            depth, rays = pose.inverse().apply(x_in_query)[:, 2], reference.view.camera.rays(self.pixels[own])
+            x = rays / rays[:, 2:] * np.where(depth > 0, depth, np.nan)[:, None]
+            points[own] = reference.world_from_camera.apply(x)
+        return points
+
     def ransac(self, options: PnpOptions) -> RigidTransform | None:
         """The query's pose by RANSAC; None without one."""
         rig = []
