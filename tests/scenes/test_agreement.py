@@ -4,6 +4,7 @@ import threading
 import time
 from collections.abc import Iterator
 from itertools import combinations
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -16,7 +17,7 @@ from mapless_server.scenes.agreement import Agreement, agreement_of
 from mapless_server.scenes.explaining import SamePose
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey
-from mapless_server.store import Store
+from mapless_server.store import SceneAttributes, Store
 
 GOOD, BAD = 0.4, 60.0
 
@@ -190,6 +191,22 @@ class TestScenes:
         pairs.errors_px = session("b", 8, GOOD)
         agreements.changed(HALL)
         assert agreements.current(HALL).warnings(arbitrary_unit=False) == []
+
+    @pytest.mark.parametrize("is_arbitrary", [False, True])
+    def test_depths_are_compared_only_in_metres(
+        self, agreements: SceneAgreements, pairs: Pairs, is_arbitrary: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        compared = set[SceneKey]()
+
+        def with_depth(scene_key: SceneKey) -> list[str]:
+            compared.add(scene_key)
+            return []
+
+        monkeypatch.setattr(agreements, "_depths", SimpleNamespace(with_depth=with_depth))
+        agreements._store.create_scene(HALL, SceneAttributes(arbitrary_unit=is_arbitrary))
+        pairs.errors_px = session("a", 8, GOOD)
+        agreements.current(HALL)
+        assert bool(compared) is not is_arbitrary
 
     def test_a_change_while_pairs_are_read_is_seen(self, agreements: SceneAgreements, pairs: Pairs) -> None:
         pairs.may_read.clear()

@@ -11,6 +11,7 @@ from mapless_server.errors import DataLoss, InvalidArgument
 from mapless_server.images import ImageLimits, decode_depth
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.options import StageContext
+from mapless_server.method.structure.measured_depth import median_depth
 from mapless_server.scenes import Choice, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
 from mapless_server.scenes.indexes import SceneIndexes
@@ -137,7 +138,7 @@ class References:
         if photo.depth is None:
             return None
         size, field = (photo.camera.width_px, photo.camera.height_px), photo.field.removesuffix("image") + "depth"
-        return float(np.nanmedian(decode_depth(photo.depth, size, self._limits, field)))
+        return median_depth(decode_depth(photo.depth, size, self._limits, field))
 
     def auditor(self, scene_key: SceneKey, named: Sequence[str] = ()) -> SceneAuditor:
         """Makes an auditor of a scene's references; the caller named those in `named`."""

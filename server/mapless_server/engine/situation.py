@@ -29,15 +29,10 @@ def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions)
         can_match_strongly=tuple(it.pipeline.matcher.pair_matching is not None for it in tiers),
         any_roll=any_roll_of(tiers),
         angles_deg=search.angles_deg,
-        has_depth=search.coarse is not None and _has_depth(search),
+        has_depth=search.coarse is not None and search.coarse.prepared.has_depth,
         known=_known(search),
         promise=promise,
     )
-
-
-def _has_depth(search: Search) -> bool:
-    references = () if search.material is None else search.material.references
-    return search.query.photo.depth is not None or any(it.depths is not None for it in references)
 
 
 def _known(search: Search) -> Known:

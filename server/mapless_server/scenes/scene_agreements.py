@@ -264,8 +264,13 @@ class SceneAgreements:
             self._check_depths(scene_key, known)
 
     def _check_depths(self, scene_key: SceneKey, known: _Known) -> None:
-        """Compares depths that were measured with references with their neighbours, the new ones first."""
-        if self._depths is None or (generation := self._store.get_generation(scene_key)) == known.depths_generation:
+        """Compares depths that were measured with references with their neighbours, the new ones first.
+
+        In a scene of arbitrary unit they are not judged.
+        """
+        if self._depths is None or self._store.get_attributes(scene_key).arbitrary_unit:
+            return
+        if (generation := self._store.get_generation(scene_key)) == known.depths_generation:
             return
         begin_s, wanted = time.monotonic(), self._depths.with_depth(scene_key)
         known.depths = {it: known.depths[it] for it in wanted if it in known.depths}

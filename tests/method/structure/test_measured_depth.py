@@ -1,11 +1,12 @@
 """Measured depth at keypoints: planted planes and steps, seen by the same camera, a smaller one and another one."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from mapless import DepthNoise, Fisheye
+from mapless import DepthImage, DepthNoise, Fisheye
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, View
 from mapless_server.method.structure.measured_depth import MeasuredDepth
@@ -49,6 +50,20 @@ def test_a_plane_has_its_depth_whatever_the_size_of_the_map(size: tuple[int, int
     noise = (0.001 + 0.002 * found.depth**2) / found.depth
     np.testing.assert_allclose(found.relative_sigma, np.hypot(noise, 0.01), rtol=1e-5)
     assert (found.common_sigma, found.source) == (0.01, DepthSource.MEASURED)
+
+
+@pytest.mark.parametrize("far_rows", [200, 280])
+def test_the_unit_is_judged_by_the_whole_image(far_rows: int) -> None:
+    """Most keypoints are on what is near: their own median would say otherwise where most of the image is far."""
+    depth = np.full((480, 640), 300.0, np.float32)
+    depth[far_rows:] = 2.0
+    view = view_of()
+    pixels = view.features.keypoints.copy()
+    pixels[:, 1] = 300 + 0.35 * pixels[:, 1]
+    measured = MeasuredDepth.of(DepthImage.of_metres(depth), depth, CAMERA)
+    found = measured.at_keypoints(replace(view, features=replace(view.features, keypoints=pixels)))
+    assert np.nanmedian(found.depth) == pytest.approx(2.0)
+    assert found.is_plausible is (far_rows < 240)
 
 
 def test_another_camera_beside_sees_the_plane_too() -> None:

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.depth import PLAUSIBLE_DEPTHS
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Distortion, Fisheye, RadialTangential, lens_model_of
 from mapless.provenance import GIVEN_POSE, Provenance
@@ -208,18 +207,14 @@ class KeypointDepths:
         relative_sigma: (N,) standard deviation of each depth, as a share of it, above 0.
         common_sigma: standard deviation of the factor that all share, as a share.
         source: where they come from.
+        is_plausible: whether the median of the whole image can be metres.
     """
 
     depth: NDArray[np.float32]
     relative_sigma: NDArray[np.float32]
     common_sigma: float
     source: DepthSource = DepthSource.NETWORK
-
-    @property
-    def is_plausible(self) -> bool:
-        """Whether their median can be metres, as depths that references are warned of cannot; true without any."""
-        known = self.depth[np.isfinite(self.depth)]
-        return not len(known) or bool(PLAUSIBLE_DEPTHS[0] <= np.median(known) <= PLAUSIBLE_DEPTHS[1])
+    is_plausible: bool = True
 
 
 class DepthMap(Protocol):

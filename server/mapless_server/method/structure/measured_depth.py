@@ -21,7 +21,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from mapless.depth import DepthImage, DepthNoise
+from mapless.depth import DepthImage, DepthNoise, implausible_median
 from mapless.geometry import Array, Camera, RigidTransform
 
 from ..features.views import DepthSource, KeypointDepths, View, undistort_pixels
@@ -36,33 +36,29 @@ class MeasuredDepth:
         depth: (H, W) float32, in the unit of poses, along its viewing direction; NaN where there is none.
         noise: standard deviations of its depths.
         camera_from_depth_camera: pose of its camera in the photograph's camera; None if it is the same.
+        median: the median of the image as its sensor gave it, by which its unit is judged; NaN if it is not known.
     """
 
     camera: Camera
     depth: NDArray[np.float32]
     noise: DepthNoise
     camera_from_depth_camera: RigidTransform | None = None
+    median: float = math.nan
 
     @staticmethod
     def of(image: DepthImage, depth: NDArray[np.float32], photo: Camera) -> "MeasuredDepth":
         """The decoded depths (H, W) of an image, measured with a photograph of this camera."""
         height, width = depth.shape
         camera = image.camera or photo.resized(width, height)
-        return MeasuredDepth(camera, depth, image.known_noise.bounded(), image.camera_from_depth_camera)
-
-    @property
-    def median(self) -> float:
-        """The median of all depths, in the unit of poses; NaN without any."""
-        known = self.depth[np.isfinite(self.depth)]
-        return float(np.median(known)) if len(known) else math.nan
+        noise, pose = image.known_noise.bounded(), image.camera_from_depth_camera
+        return MeasuredDepth(camera, depth, noise, pose, median_depth(depth))
 
     def at_keypoints(self, view: View) -> KeypointDepths:
         """The depths at the keypoints of the photograph, with their standard deviations."""
         depth = self.at_pixels(view.camera, view.features.pixels())
         sigma = np.hypot(self.noise.relative_sigma(depth), self.noise.common)
-        return KeypointDepths(
-            depth.astype(np.float32), sigma.astype(np.float32), self.noise.common, DepthSource.MEASURED
-        )
+        known, common = (depth.astype(np.float32), sigma.astype(np.float32)), self.noise.common
+        return KeypointDepths(*known, common, DepthSource.MEASURED, not implausible_median(self.median))
 
     def on_grid(self, camera: Camera, count: int) -> tuple[Array, Array]:
         """Pixels (N, 2) of the photograph's camera (a pinhole), on a grid of about so many, and their depths (N,)."""
@@ -103,7 +99,7 @@ class MeasuredDepth:
             inside = (depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         nearest = np.full(width * height, np.inf, np.float32)
         np.minimum.at(nearest, (row[inside] * width + column[inside]).astype(np.intp), depth[inside])
-        return MeasuredDepth(target, _filled(nearest.reshape(height, width)), self.noise)
+        return MeasuredDepth(target, _filled(nearest.reshape(height, width)), self.noise, median=self.median)
 
     def _seen_pixels(self, target: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Columns and rows (H, W) of a pinhole at the photograph's place that show the depths, and depths there.
@@ -131,6 +127,11 @@ class MeasuredDepth:
         if self.camera.distortion is not None:
             pixels = undistort_pixels(pixels, self.camera)
         return np.asarray(self.camera.rays(pixels) * self.depth[rows, columns, None].astype(np.float64))
+
+
+def median_depth(depth: NDArray[np.float32]) -> float:
+    """Median of the depths (H, W) of an image that has some; NaN is none."""
+    return float(np.median(depth[np.isfinite(depth)]))
 
 
 def _depth_at(depth: NDArray[np.float32], pixels: Array, noise: DepthNoise) -> Array:
