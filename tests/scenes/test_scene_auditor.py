@@ -1,9 +1,9 @@
 """An audit of what is stored: damaged and vanishing references cost themselves and no other."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,9 +13,11 @@ from support.stores import damage
 
 from mapless_server.errors import NotFound, Unavailable
 from mapless_server.method.features.views import PosedView, View
+from mapless_server.method.structure.depth_mistakes import DepthVerdict
 from mapless_server.scenes import AuditVerdict, CoverageVerdict, Viewpoint
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
+from mapless_server.scenes.depth_checks import DepthCheck, DepthChecks
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.security import SceneKey
@@ -103,6 +105,27 @@ def test_a_neighbour_deleted_during_an_audit_loses_no_answer(store: Store) -> No
     view = Viewpoint(REFERENCES[0].view.camera, REFERENCES[0].world_from_camera)
     assert auditor.check_coverage(view, go_on).verdict is not CoverageVerdict.NOT_LOCALIZABLE
     assert verdicts(auditor, ["r2", "r3", "r4"]) == [AuditVerdict.CONSISTENT, None, AuditVerdict.CONSISTENT]
+
+
+class Depths:
+    """r0 and r1 doubt each other, as r2 and r3 do; r3 is wrong."""
+
+    def check(self, scene_key: SceneKey, reference_id: str, check: Any) -> DepthCheck | None:
+        neighbour = {"r0": "r1", "r1": "r0", "r2": "r3", "r3": "r2"}.get(reference_id)
+        if neighbour is None:
+            return None
+        mistake, doubt = ("it is long", "") if reference_id == "r3" else ("", "it is short")
+        return DepthCheck(reference_id, DepthVerdict(mistake=mistake, doubt=doubt), (neighbour,))
+
+
+def test_doubts_about_depths_are_findings_unless_a_wrong_one_explains_them(store: Store) -> None:
+    auditor = SceneAuditor(replace(tools_of(store), depths=cast("DepthChecks", Depths())), KEY)
+    doubtful, found = AuditVerdict.DOUBTFUL_DEPTH, verdicts(auditor, ["r0", "r1", "r2", "r3", "r4"])
+    assert found == [doubtful, doubtful, AuditVerdict.CONSISTENT, AuditVerdict.WRONG_DEPTH, AuditVerdict.CONSISTENT]
+    assert not doubtful.is_alarm
+    audit = auditor.audit("r0", go_on)
+    assert audit is not None
+    assert audit.message.endswith("either this depth is wrong or that of 'r1': it is short")
 
 
 def test_a_deleted_reference_is_an_error_only_if_named(store: Store) -> None:

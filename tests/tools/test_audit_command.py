@@ -32,17 +32,18 @@ FINDINGS = [
     finding("dark", "UNVERIFIABLE", focal_ratio=0.0),
     finding("far", "WRONG_POSE", 0.5),
     finding("swapped", "SWAPPED_IMAGE"),
+    finding("either", "DOUBTFUL_DEPTH"),
 ]
 
 
 def test_the_worst_comes_first() -> None:
     names = [a.name.rsplit("/", 1)[-1] for a in worst_first(FINDINGS)]
-    assert names == ["swapped", "far", "near", "dark", "fine"]
+    assert names == ["swapped", "far", "near", "either", "dark", "fine"]
 
 
 def test_the_summary_counts_every_finding() -> None:
-    expected = "5 references: 1 swapped image, 2 wrong pose, 1 unverifiable, 1 consistent"
-    assert summary_of(Examined("hall", worst_first(FINDINGS), 5)) == expected
+    expected = "6 references: 1 swapped image, 2 wrong pose, 1 doubtful depth, 1 unverifiable, 1 consistent"
+    assert summary_of(Examined("hall", worst_first(FINDINGS), 6)) == expected
     assert summary_of(Examined("hall", total=0)) == "0 references: none"
 
 
@@ -103,10 +104,10 @@ def test_a_wrong_focal_length_is_printed_with_its_factor() -> None:
 
 
 def test_reports_hold_every_reference_and_escape_names() -> None:
-    content = json.loads(json.dumps(to_json(Examined("hall", FINDINGS, 5)), allow_nan=False))
+    content = json.loads(json.dumps(to_json(Examined("hall", FINDINGS, 6)), allow_nan=False))
     assert [r["verdict"] for r in content["references"]] == [a.verdict for a in FINDINGS]
-    page = to_html(Examined("hall", FINDINGS, 5))
-    assert page.count('<tr class="') == 5
+    page = to_html(Examined("hall", FINDINGS, 6))
+    assert page.count('<tr class="') == 6
     assert page.count('<tr class="alarm">') == 3
     assert "&lt;far&gt;" in page
     assert "<far>" not in page

@@ -28,6 +28,7 @@ class AuditVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     AUDIT_VERDICT_SCENE_CHANGED: _ClassVar[AuditVerdict]
     AUDIT_VERDICT_UNVERIFIABLE: _ClassVar[AuditVerdict]
     AUDIT_VERDICT_WRONG_DEPTH: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_DOUBTFUL_DEPTH: _ClassVar[AuditVerdict]
 
 class CoverageVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -48,6 +49,7 @@ AUDIT_VERDICT_DUPLICATE: AuditVerdict
 AUDIT_VERDICT_SCENE_CHANGED: AuditVerdict
 AUDIT_VERDICT_UNVERIFIABLE: AuditVerdict
 AUDIT_VERDICT_WRONG_DEPTH: AuditVerdict
+AUDIT_VERDICT_DOUBTFUL_DEPTH: AuditVerdict
 COVERAGE_VERDICT_UNSPECIFIED: CoverageVerdict
 COVERAGE_VERDICT_LOCALIZABLE: CoverageVerdict
 COVERAGE_VERDICT_DOUBTFUL: CoverageVerdict

@@ -39,7 +39,7 @@ COMPARED = 1000
 """References whose poses are compared with what is known of the scene."""
 MAX_TIMEOUT_S = 600.0
 """The default of the server's setting max_deadline_s."""
-_ORDER = (*ALARMS, "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
+_ORDER = (*ALARMS, "DOUBTFUL_DEPTH", "DUPLICATE", "UNVERIFIABLE", "CONSISTENT")
 
 
 @with_flags

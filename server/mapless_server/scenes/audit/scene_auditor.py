@@ -136,13 +136,19 @@ class SceneAuditor:
 
     def _with_depth(self, found: ReferenceAudit, reference_id: str) -> ReferenceAudit:
         """The audit of a reference with what is wrong with its measured depth, unless a worse fault explains it."""
-        if found.verdict.is_alarm or self._tools.depths is None:
+        depths = self._tools.depths
+        if found.verdict.is_alarm or depths is None:
             return found
-        checked = self._tools.depths.check(self._scene_key, reference_id, self._check)
+        checked = depths.check(self._scene_key, reference_id, self._check)
         if checked is not None and checked.verdict.mistake:
             return replace(found, verdict=AuditVerdict.WRONG_DEPTH, message=f"its depth: {checked.verdict.mistake}")
         if checked is not None and checked.doubt:
-            return replace(found, message="; ".join(it for it in (found.message, checked.doubt) if it))
+            for it in checked.neighbours:
+                other = depths.check(self._scene_key, it, self._check)
+                if other is not None and other.verdict.mistake:  # this explains the doubt
+                    return found
+            text = "; ".join(it for it in (found.message, checked.doubt) if it)
+            return replace(found, verdict=AuditVerdict.DOUBTFUL_DEPTH, message=text)
         return found
 
     def _check_coverage(self, view: Viewpoint) -> Coverage:

@@ -19,6 +19,8 @@ class AuditVerdict(str, Enum):
     """Pose and intrinsics fit, or cannot be judged, but it does not show what its neighbours show there."""
     WRONG_DEPTH = "wrong_depth"
     """Pose and intrinsics fit, or cannot be judged, but the depth that was measured with it does not."""
+    DOUBTFUL_DEPTH = "doubtful_depth"
+    """As before, but the neighbours' depth may be the wrong one."""
     DUPLICATE = "duplicate"
     """Nothing is wrong, but another reference is the same photograph, or the same view from the same place."""
     UNVERIFIABLE = "unverifiable"
