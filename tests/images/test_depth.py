@@ -1,5 +1,6 @@
 """Depth images of callers: what is a value, and what is refused, by the field that is wrong."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -71,7 +72,8 @@ BAD = {
     "no PNG": (replace(DEPTH, data=b"\xff\xd8\xff"), "DEPTH_NOT_PNG", ".png"),
     "empty": (replace(DEPTH, data=b""), "DEPTH_NOT_PNG", ".png"),
     "cut": (replace(DEPTH, data=DEPTH.data[:-30]), "IMAGE_UNDECODABLE", ".png"),
-    "a bomb": (replace(DEPTH, data=png(np.zeros((9000, 9000), np.uint16))), "IMAGE_TOO_LARGE", ".png"),
+    "a bomb": (replace(DEPTH, data=png(np.zeros((9000, 9000), np.uint16))), "DEPTH_TOO_LARGE", ".png"),
+    "a long side": (replace(DEPTH, data=png(np.ones((32, 16385), np.uint16))), "DEPTH_TOO_LARGE", ".png"),
     "many pixels": (replace(DEPTH, data=png(np.ones((1600, 2560), np.uint16))), "DEPTH_TOO_LARGE", ".png"),
     "many values": (DepthImage.of_metres(np.ones((1600, 2560), np.float32)), "DEPTH_TOO_LARGE", ".float32"),
     "another aspect": (replace(DEPTH, data=png(np.ones((240, 240), np.uint16))), "DEPTH_SIZE", ".intrinsics"),
@@ -89,3 +91,22 @@ BAD = {
 @pytest.mark.parametrize(("depth", "reason", "field"), BAD.values(), ids=BAD)
 def test_a_bad_depth_is_refused_by_its_field(depth: DepthImage, reason: str, field: str) -> None:
     assert fault(depth) == (reason, field)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"", "16 bits, is empty"),
+        (b"\xff\xd8\xff\xe0", "is a JPEG"),
+        (b"II*\0\x08", "is a TIFF"),
+        (b"<html>\n<body>not found", "is text, which begins with '<html>"),
+        (METRES.tobytes(), "begins with the bytes 00 00 c0 3f: float32 values need their width and height"),
+        (png(STEPS)[:20], "the depth ends within its header"),
+        (png(STEPS[:31]), "the depth is 320x31 pixels, its sides must be at least 32"),
+        (png(np.ones((1600, 2560), np.uint16)), "the depth is 2560x1600 pixels; at most 4000000 in all"),
+    ],
+    ids=lambda it: it if isinstance(it, str) else "",
+)
+def test_a_message_says_what_the_depth_is_instead(data: bytes, said: str) -> None:
+    with pytest.raises(InvalidArgument, match=re.escape(said)):
+        decoded(replace(DEPTH, data=data))

@@ -55,34 +55,34 @@ ANY_SIZE = ImageLimits(max_bytes=2**40, max_pixels=2**40, min_side_px=1, max_sid
 """For images whose header alone is read, and for stored ones, which were accepted with the limits of their time."""
 
 
-def image_size(data: bytes, limits: ImageLimits, field: str = "image") -> tuple[int, int]:
-    """Width and height of an image, pixels, from its header alone.
+def image_size(data: bytes, limits: ImageLimits, field: str = "image", what: str = "image") -> tuple[int, int]:
+    """Width and height of an image, pixels, from its header alone; messages say `what` it is.
 
     InvalidArgument, naming `field`, if the file is empty, has too many bytes, is not a JPEG, PNG or WebP, is cut within
     its header, or has a size that is not accepted.
     """
     if not data:
-        raise InvalidArgument("the image is empty", reason="IMAGE_EMPTY", field=field)
+        raise InvalidArgument(f"the {what} is empty", reason="IMAGE_EMPTY", field=field)
     if len(data) > limits.max_bytes:
         raise InvalidArgument(
-            f"the image has {len(data)} bytes, at most {limits.max_bytes} are accepted",
+            f"the {what} has {len(data)} bytes, at most {limits.max_bytes} are accepted",
             reason="IMAGE_TOO_LARGE",
             field=field,
         )
     try:
-        width, height = size_of_image(data, "image")
+        width, height = size_of_image(data, what)
     except BadHeader as error:
         raise InvalidArgument(str(error), reason=error.reason, field=field) from None
     if min(width, height) < limits.min_side_px:
         raise InvalidArgument(
-            f"the image is {width}x{height} pixels, its sides must be at least {limits.min_side_px}",
+            f"the {what} is {width}x{height} pixels, its sides must be at least {limits.min_side_px}",
             reason="IMAGE_TOO_SMALL",
             field=field,
         )
     if max(width, height) > limits.max_side_px or width * height > limits.max_pixels:
         raise InvalidArgument(
-            f"the image is {width}x{height} pixels; at most {limits.max_pixels} in all and {limits.max_side_px} a side "
-            "are accepted: reduce it, by half for instance, and its intrinsics with it",
+            f"the {what} is {width}x{height} pixels; at most {limits.max_pixels} in all and {limits.max_side_px} a "
+            "side are accepted: reduce it, by half for instance, and its intrinsics with it",
             reason="IMAGE_TOO_LARGE",
             field=field,
         )

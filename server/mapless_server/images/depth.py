@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mapless.depth import DepthImage
 from mapless_server.errors import InvalidArgument
 
-from .decode import ImageLimits, image_size
+from .decode import ANY_SIZE, ImageLimits, image_size
 from .png_chunks import essential_png, png_chunk_names
 
 T = TypeVar("T", np.uint8, np.uint16)
@@ -22,6 +22,16 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _BITS, _COLOUR = 24, 25
 """Positions of the bits of a channel, and of the colour type, in a PNG."""
 _GREY = 0
+_OTHERS = {
+    b"\xff\xd8": "a JPEG, whose values are not exact",
+    b"II*\0": "a TIFF",
+    b"MM\0*": "a TIFF",
+    b"RIFF": "a WebP",
+    b"\x76\x2f\x31\x01": "an OpenEXR file",
+    b"\x93NUMPY": "a file of NumPy",
+    b"P5": "a PGM",
+}
+"""Files that are no PNG, by their first bytes."""
 _SATURATED = 65535
 
 
@@ -32,14 +42,13 @@ def check_depth(depth: DepthImage, photo: tuple[int, int], limits: ImageLimits, 
     another size than the depth camera, or without one than the photograph's aspect; likewise its confidence, of 8 bits.
     """
     path = f"{field}.png" if depth.size is None else f"{field}.float32"
-    size = depth.size or _checked_png(depth.data, 16, limits, path)
-    if size[0] * size[1] > limits.max_depth_pixels:
+    _check_bytes(depth.data, limits, path, "depth")
+    size = depth.size or _checked_png(depth.data, 16, limits.min_side_px, path, "depth")
+    if size[0] * size[1] > limits.max_depth_pixels or max(size) > limits.max_side_px:
         message = (
-            f"the depth is {size[0]}x{size[1]} pixels, at most {limits.max_depth_pixels} in all are accepted: reduce it"
+            f"the depth is {size[0]}x{size[1]} pixels; at most {limits.max_depth_pixels} in all and "
+            f"{limits.max_side_px} a side are accepted: reduce it, and its intrinsics with it"
         )
-        raise InvalidArgument(message, reason="DEPTH_TOO_LARGE", field=path)
-    if len(depth.data) > limits.max_bytes:
-        message = f"the depth has {len(depth.data)} bytes, at most {limits.max_bytes} are accepted"
         raise InvalidArgument(message, reason="DEPTH_TOO_LARGE", field=path)
     camera = depth.camera
     if camera is not None and (camera.width_px, camera.height_px) != size:
@@ -55,7 +64,8 @@ def check_depth(depth: DepthImage, photo: tuple[int, int], limits: ImageLimits, 
         raise InvalidArgument(message, reason="DEPTH_SIZE", field=f"{field}.intrinsics")
     if depth.confidence:
         path = f"{field}.confidence"
-        if (found := _checked_png(depth.confidence, 8, replace(limits, min_side_px=1), path)) != size:
+        _check_bytes(depth.confidence, limits, path, "confidence")
+        if (found := _checked_png(depth.confidence, 8, 1, path, "confidence")) != size:
             message = f"the confidence is {found[0]}x{found[1]} pixels, the depth {size[0]}x{size[1]}"
             raise InvalidArgument(message, reason="DEPTH_SIZE", field=path)
 
@@ -91,11 +101,18 @@ def decode_depth(
     return values
 
 
-def _checked_png(data: bytes, bits: int, limits: ImageLimits, field: str) -> tuple[int, int]:
-    """Width and height of a PNG with one channel of so many bits, by its header."""
+def _check_bytes(data: bytes, limits: ImageLimits, field: str, what: str) -> None:
+    if len(data) > limits.max_bytes:
+        message = f"the {what} has {len(data)} bytes, at most {limits.max_bytes} are accepted"
+        raise InvalidArgument(message, reason="DEPTH_TOO_LARGE", field=field)
+
+
+def _checked_png(data: bytes, bits: int, min_side_px: int, field: str, what: str) -> tuple[int, int]:
+    """Width and height, of any size from the least, of a PNG with one channel of so many bits, by its header."""
     if not data.startswith(_PNG):
-        raise InvalidArgument(f"must be a PNG with one channel of {bits} bits", reason="DEPTH_NOT_PNG", field=field)
-    size = image_size(data, limits, field)
+        message = f"must be a PNG with one channel of {bits} bits, {_found_instead(data)}"
+        raise InvalidArgument(message, reason="DEPTH_NOT_PNG", field=field)
+    size = image_size(data, replace(ANY_SIZE, min_side_px=min_side_px), field, what)
     if data[_BITS] != bits or data[_COLOUR] != _GREY:
         message = (
             f"the PNG must have one channel of {bits} bits, has {data[_BITS]} bits and colour type {data[_COLOUR]}"
@@ -104,6 +121,19 @@ def _checked_png(data: bytes, bits: int, limits: ImageLimits, field: str) -> tup
     if b"acTL" in png_chunk_names(data):
         raise InvalidArgument("the PNG is animated; it must have one picture", reason="DEPTH_UNSUPPORTED", field=field)
     return size
+
+
+def _found_instead(data: bytes) -> str:
+    """A clause that says what a file is that is no PNG, by its first bytes."""
+    if not data:
+        return "is empty"
+    known = (kind for start, kind in _OTHERS.items() if data.startswith(start))
+    if kind := next(known, ""):
+        return f"is {kind}"
+    first = data[:16]
+    if first.isascii() and first.decode().replace("\n", "").isprintable():
+        return f"is text, which begins with {first.decode()!r}"
+    return f"begins with the bytes {first[:4].hex(' ')}: float32 values need their width and height"
 
 
 def _decoded(data: bytes, kind: type[T], field: str) -> NDArray[T]:
