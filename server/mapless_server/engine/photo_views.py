@@ -46,6 +46,7 @@ class _Decoded:
         self._photo, self._limits = photo, limits
         self._photograph: Photograph | None = None
         self._depth: NDArray[np.float32] | None = None
+        self._measured: dict[Camera, MeasuredDepth] = {}
 
     @cached_property
     def upright_deg(self) -> float:
@@ -70,7 +71,9 @@ class _Decoded:
         assert self._photo.depth is not None
         if self._depth is None:
             self._depth = self._photo.read_depth(self._limits)
-        return MeasuredDepth.of(self._photo.depth, self._depth, camera)
+        if camera not in self._measured:
+            self._measured[camera] = MeasuredDepth.of(self._photo.depth, self._depth, camera)
+        return self._measured[camera]
 
 
 class QueryViews:

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapless import DepthImage, DepthNoise, Fisheye
+from mapless import DepthImage, DepthNoise, Fisheye, RadialTangential
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
-from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, View
+from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, View, undistort_pixels
 from mapless_server.method.structure.measured_depth import MeasuredDepth
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 322.0, 238.0)
@@ -30,8 +30,9 @@ def plane_depth(rays: np.ndarray) -> np.ndarray:
 
 def plane_map(camera: Camera, camera_from_depth: RigidTransform | None = None) -> np.ndarray:
     """The plane, fixed in the photograph's camera, as a depth camera sees it."""
-    rows, columns = np.mgrid[: camera.height_px, : camera.width_px]
-    rays = camera.rays(np.stack([columns, rows], axis=-1))
+    pixels = np.stack(np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px)), axis=-1)
+    ideal = undistort_pixels(pixels.reshape(-1, 2).astype(np.float64), camera)
+    rays = camera.rays(ideal).reshape(*pixels.shape[:2], 3)
     pose = camera_from_depth or RigidTransform.identity()
     depth = (DISTANCE_M - pose.translation @ NORMAL) / (rays @ (pose.rotation.T @ NORMAL))
     return np.asarray(depth, np.float32)
@@ -76,6 +77,31 @@ def test_another_camera_beside_sees_the_plane_too() -> None:
     assert np.nanquantile(np.abs(error), 0.95) < 0.002
     mistaken = MeasuredDepth(depth_camera, plane_map(depth_camera, pose), NOISE).at_keypoints(view)
     assert np.nanmedian(np.abs(error_of(mistaken, view))) > 0.003, "taken for the photograph's own camera it is off"
+
+
+@pytest.mark.parametrize("lens", [RadialTangential(-0.1, 0.05, 0.001, 0.001, 0.0), Fisheye(0.05, -0.02, 0.01, 0.0)])
+def test_a_large_map_of_a_lens_is_as_exact_as_a_small_one(lens: Fisheye | RadialTangential) -> None:
+    """A lens is undistorted on a lattice, which is each pixel of a small map."""
+    pose, view = RigidTransform(np.eye(3), np.array([0.05, 0.0, 0.0])), view_of()
+    for size in ((640, 480), (1024, 768)):
+        depth_camera = replace(Camera(640, 480, 480.0, 480.0, 320.0, 240.0).resized(*size), distortion=lens)
+        measured = MeasuredDepth(depth_camera, plane_map(depth_camera, pose), NOISE, pose)
+        error = error_of(measured.at_keypoints(view), view)
+        assert np.isfinite(error).mean() > 0.8
+        assert np.nanquantile(np.abs(error), 0.95) < 0.0025
+        assert measured.in_photograph(CAMERA) is measured.in_photograph(CAMERA), "computed once"
+
+
+@pytest.mark.parametrize("size", [(64, 48), (40, 30)])
+def test_a_map_is_reduced_to_the_photographs_pixels(size: tuple[int, int]) -> None:
+    pose, small = RigidTransform(np.eye(3), np.array([0.05, 0.0, 0.0])), CAMERA.resized(*size)
+    depth_camera = replace(CAMERA, distortion=Fisheye(0.05, -0.02, 0.01, 0.0))
+    measured = MeasuredDepth(depth_camera, plane_map(depth_camera, pose), NOISE, pose)
+    assert np.isfinite(measured.seen_by(small).depth).mean() > 0.7
+    columns, rows = np.meshgrid(np.arange(4, size[0] - 4), np.arange(4, size[1] - 4))
+    pixels = np.stack([columns, rows], -1).reshape(-1, 2).astype(np.float64)
+    error = measured.at_pixels(small, pixels) / plane_depth(small.rays(pixels)) - 1
+    assert np.nanmedian(np.abs(error)) < 0.01
 
 
 def test_the_nearer_of_two_surfaces_hides_the_other() -> None:
@@ -132,12 +158,7 @@ def test_holes_of_the_sensor_have_no_depth() -> None:
 def test_a_lens_bends_the_map_as_the_photograph() -> None:
     lens = Camera(640, 480, 400.0, 400.0, 322.0, 238.0, Fisheye(0.05, -0.01, 0.0, 0.0))
     view = view_of(lens, 300)
-    rows, columns = np.mgrid[:480, :640]
-    from mapless_server.method.features.views import undistort_pixels
-
-    ideal = undistort_pixels(np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(float), lens)
-    depth = plane_depth(lens.pinhole().rays(ideal)).reshape(480, 640).astype(np.float32)
-    error = error_of(MeasuredDepth(lens, depth, NOISE).at_keypoints(view), view)
+    error = error_of(MeasuredDepth(lens, plane_map(lens), NOISE).at_keypoints(view), view)
     assert np.isfinite(error).mean() > 0.9
     assert np.nanmax(np.abs(error)) < 1e-3
 
