@@ -95,3 +95,25 @@ def test_a_dry_run_names_depth_that_a_server_would_refuse(tmp_path: Path) -> Non
     assert (done.exit_code, "the PNG is cut off" in done.output) == (1, True), done.output
     assert len(dataset.frames) == 1
     assert run("import", tmp_path, "nowhere", "--dry-run", "--skip-check", "--no-depth").exit_code == 0
+
+
+@pytest.mark.parametrize(("unit", "is_wrong"), [("1", True), ("0.001", False)])
+def test_an_import_says_that_a_unit_cannot_be_right(tmp_path: Path, unit: str, is_wrong: bool) -> None:
+    read(tmp_path, {"depth": "depth/1.png"}, ALL)
+    size = CAMERA.height_px, CAMERA.width_px
+    (tmp_path / "depth" / "1.png").write_bytes(encode(".png", np.full(size, 1900, np.uint16)))
+    done = run("import", tmp_path, "nowhere", "--dry-run", "--skip-check", "--depth-unit", unit)
+    assert ("depth: 1 of 1 have a median of 1900 m" in done.output) is is_wrong, done.output
+    assert "is not stated" not in done.output
+
+
+def test_an_import_says_that_the_sensor_is_unknown(tmp_path: Path) -> None:
+    read(tmp_path, {"depth": "depth/1.png"}, {"depth_unit_m": 0.001})
+    done = run("import", tmp_path, "nowhere", "--dry-run", "--skip-check")
+    assert "depth: the sensor of 1 of 1 is not stated, so 5 % of their scale" in done.output
+
+
+def test_a_topic_of_depths_is_of_a_recording(tmp_path: Path) -> None:
+    read(tmp_path, {"depth": "depth/1.png"}, ALL)
+    done = run("import", tmp_path, "nowhere", "--dry-run", "--depth-topic", "/depth")
+    assert (done.exit_code, "--depth-topic is of a recording" in done.output) == (2, True), done.output

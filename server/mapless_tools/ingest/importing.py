@@ -26,6 +26,7 @@ from mapless_tools.output_files import check_writable, write_json
 from mapless_tools.progress import Progress, progress_bars
 
 from .check import check_frames, check_with_scene
+from .depth_notes import implausible_unit, unknown_sensor
 from .existing import NO_METRES, KnownReferences, WrongUnit, open_scene
 from .formats import ReadOptions, read_dataset
 from .metres import MetreOptions, in_metres, read_positions
@@ -100,8 +101,12 @@ def run_import(
         _print(f"note: {note}")
     if not dataset.metric:
         _print(f"note: {NO_METRES}")
+    if note := unknown_sensor(frames):
+        _print(f"note: {note}")
     report = ImportReport(scene, dataset, frames, is_dry=connection is None)
     with terminable(), _reported(report, report_file):
+        if dataset.metric:
+            _warn(report, [implausible_unit(frames)])
         if options.check:
             with progress_bars() as progress:
                 _warn(report, much_ignored(frames))

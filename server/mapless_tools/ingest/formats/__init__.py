@@ -53,12 +53,15 @@ def read_dataset(path: Path, format: str = "auto", options: ReadOptions | None =
     if format != "auto" and format not in FORMATS:
         raise ValueError(f"format must be auto or one of {', '.join(FORMATS)}, not {format!r}")
     _check_there(path)
-    module = _module(recognize(path) if format == "auto" else format)
+    name = recognize(path) if format == "auto" else format
+    options = options or ReadOptions()
+    if options.depths.depth_topic and name != "rosbag":
+        raise ValueError(f"--depth-topic is of a recording, and {path} is a folder in the layout {name}")
     try:
-        dataset: Dataset = module.read(path, options or ReadOptions())
+        dataset: Dataset = _module(name).read(path, options)
     except ValueError as error:
         raise ValueError(printable(str(error))) from error
-    return _with_masks(dataset, path, options or ReadOptions())
+    return _with_masks(dataset, path, options)
 
 
 def _with_masks(dataset: Dataset, path: Path, options: ReadOptions) -> Dataset:
