@@ -337,6 +337,8 @@ class Rejected:
             if it.in_axes is not None and it.in_axes.axes != "OPENCV":
                 pose, frame = it.in_axes.world_from_camera, f", in {it.in_axes.axes} axes"
             text += [f"  the pose that is too imprecise{frame}:", *pose_lines(pose, it.accuracy, it.arbitrary_unit)]
+        check = self.diagnostics.depth_check
+        text += [f"  the photograph's depth: {check.refusal}"] if check is not None and check.refusal else []
         text += [f"  {it}" for it in self.diagnostics.ladder_cuts]
         if self.diagnostics.captured:
             text.append(f"  {_CAPTURED}")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from .depth import implausible_median
 from .geometry import Array
 
 
@@ -107,7 +108,9 @@ class DepthCheck:
         factor_sigma: its standard deviation, as a share.
         conflict: whether the depths contradict the pose, or their own matches, or cannot be metres; they do not correct
             the pose then.
-        used: whether the depths contributed to the pose.
+        used: whether the depths contributed to the pose: improved it, or gave points.
+        median: median of the whole depth image, in the unit of poses; 0 where no attempt came so far.
+        point_count: inliers of the pose on points whose distance these depths give.
     """
 
     keypoint_count: int
@@ -117,11 +120,26 @@ class DepthCheck:
     factor_sigma: float
     conflict: bool
     used: bool
+    median: float = 0.0
+    point_count: int = 0
+
+    @property
+    def refusal(self) -> str:
+        """Why a depth that cannot be metres is not used; empty for another one, and of servers before 0.4."""
+        text = implausible_median(self.median) if self.median and self.conflict and not self.compared_count else ""
+        return text and f"its median is {text}: not used; is unit_m right, 0.001 for millimetres?"
 
     def __str__(self) -> str:
+        if self.refusal:
+            return self.refusal
+        gives = f"gives {self.point_count} of the points" if self.point_count else ""
         if not self.factor:
-            return f"{self.keypoint_count} keypoints have one, too few to compare ({self.compared_count})"
+            outcome = gives or f"too few to compare ({self.compared_count})"
+            doubt = "; they contradict their own matches" if self.conflict else ""
+            return f"{self.keypoint_count} keypoints have one, {outcome}{doubt}"
         outcome = "contradicts the photograph, not used" if self.conflict else "used" if self.used else "not needed"
+        if gives:
+            outcome = f"contradicts other points, {gives}" if self.conflict else gives
         factor = f"{self.factor:.4g} (+- {100 * self.factor_sigma:.2g} %) times the pose's"
         return f"{self.agreeing_count} of {self.compared_count} agree, {factor}: {outcome}"
 

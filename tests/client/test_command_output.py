@@ -94,6 +94,10 @@ def test_a_coarse_pose_is_not_called_localized(is_final: bool, first: str) -> No
             "998 (+- 30 %) times the pose's: contradicts",
         ),
         (DepthCheck(900, 90, 88, 1.0, 0.002, False, False), "pose's: not needed"),
+        (DepthCheck(900, 90, 88, 1.0, 0.002, False, True, 2.0, 34), "pose's: gives 34 of the points"),
+        (DepthCheck(900, 0, 0, 0.0, 0.0, False, True, 2.0, 509), "900 keypoints have one, gives 509 of the points"),
+        (DepthCheck(900, 0, 0, 0.0, 0.0, True, False, 1880.0), "its median is 1880 m, outside 0.05 to 200 m: not used"),
+        (DepthCheck(900, 3, 0, 0.0, 0.0, False, False, 2.0), "900 keypoints have one, too few to compare (3)"),
         (DepthCheck(900, 3, 0, 0.0, 0.0, False, False), "900 keypoints have one, too few to compare (3)"),
     ],
 )

@@ -94,3 +94,31 @@ def test_a_depth_of_another_unit_gives_no_pose(tmp_path: Path) -> None:
         assert "so it is not used: is unit_m right" in warning
         answer = client.localize(reference.data, reference.camera, "room")
         assert not isinstance(answer, LocalizationResult)
+
+
+def test_a_photographs_depth_says_that_it_gives_points_or_why_it_is_not_used(tmp_path: Path) -> None:
+    reference, photograph = room().references[:2]
+    depth = replace(depth_of(photograph.name), sensor=DepthSensor.UNKNOWN)
+    with (
+        serving_really(tmp_path, features="sift", background_matching=False) as server,
+        Client(server.address) as client,
+    ):
+        client.create_scene("room")
+        new = NewReference("one", reference.data, reference.camera, reference.world_from_camera)
+        client.add_reference("room", new)
+        found, refused = (
+            client.localize(photograph.data, photograph.camera, "room", depth=it, include_debug=True)
+            for it in (depth, replace(depth, unit_m=1.0))
+        )
+        assert isinstance(found, LocalizationResult)
+        assert found.debug is not None
+        check, other = found.diagnostics.depth_check, refused.diagnostics.depth_check
+        assert check is not None
+        assert other is not None
+        assert (check.used, check.conflict) == (True, False)
+        assert check.point_count == found.debug.inliers_by_source()["PHOTOGRAPH_DEPTH"] == found.inlier_count
+        assert f"gives {check.point_count} of the points" in str(found)
+        assert not isinstance(refused, LocalizationResult)
+        assert (other.used, other.conflict) == (False, True)
+        assert other.median == pytest.approx(1000 * check.median)
+        assert "m, outside 0.05 to 200 m: not used; is unit_m right" in str(refused)

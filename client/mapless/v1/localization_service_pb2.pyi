@@ -594,7 +594,7 @@ class Diagnostics(_message.Message):
     def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ..., ladder_cuts: _Optional[_Iterable[_Union[LadderCut, _Mapping]]] = ..., depth_check: _Optional[_Union[DepthCheck, _Mapping]] = ...) -> None: ...
 
 class DepthCheck(_message.Message):
-    __slots__ = ("keypoint_count", "compared_count", "agreeing_count", "factor", "factor_sigma", "conflict", "used")
+    __slots__ = ("keypoint_count", "compared_count", "agreeing_count", "factor", "factor_sigma", "conflict", "used", "median", "point_count")
     KEYPOINT_COUNT_FIELD_NUMBER: _ClassVar[int]
     COMPARED_COUNT_FIELD_NUMBER: _ClassVar[int]
     AGREEING_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -602,6 +602,8 @@ class DepthCheck(_message.Message):
     FACTOR_SIGMA_FIELD_NUMBER: _ClassVar[int]
     CONFLICT_FIELD_NUMBER: _ClassVar[int]
     USED_FIELD_NUMBER: _ClassVar[int]
+    MEDIAN_FIELD_NUMBER: _ClassVar[int]
+    POINT_COUNT_FIELD_NUMBER: _ClassVar[int]
     keypoint_count: int
     compared_count: int
     agreeing_count: int
@@ -609,7 +611,9 @@ class DepthCheck(_message.Message):
     factor_sigma: float
     conflict: bool
     used: bool
-    def __init__(self, keypoint_count: _Optional[int] = ..., compared_count: _Optional[int] = ..., agreeing_count: _Optional[int] = ..., factor: _Optional[float] = ..., factor_sigma: _Optional[float] = ..., conflict: bool = ..., used: bool = ...) -> None: ...
+    median: float
+    point_count: int
+    def __init__(self, keypoint_count: _Optional[int] = ..., compared_count: _Optional[int] = ..., agreeing_count: _Optional[int] = ..., factor: _Optional[float] = ..., factor_sigma: _Optional[float] = ..., conflict: bool = ..., used: bool = ..., median: _Optional[float] = ..., point_count: _Optional[int] = ...) -> None: ...
 
 class LadderCut(_message.Message):
     __slots__ = ("rung", "features", "reason", "unmatched_reference_count")

@@ -19,7 +19,7 @@ from .bundle.priors import NO_PRIORS, Priors
 from .coarse import Outcome, Reconstructor, Request, Triangulation, reconstruct_one
 from .coarse.geometric import GeometricReconstructor, point_maps
 from .coarse.scale import depth_scale, estimate_scale, known_scale, network_scale
-from .features.views import Matches, PosedView, Reconstruction, View
+from .features.views import KeypointDepths, Matches, PosedView, Reconstruction, View
 from .judge.answer import Answer, Localization, shifted
 from .judge.judge import JudgeOptions
 from .options import LocalizeOptions, StageContext, Variant
@@ -106,7 +106,7 @@ class Prepared:
         context: cancels the computation and times its stages.
         priors: priors on the query's pose, in the world of `references`.
         is_metric: whether the unit of the references' poses is the metre.
-        implausible_depths: number of the query's keypoints with depths that cannot be metres, and are not used.
+        implausible_depths: the query's depths, if they cannot be metres and are not used; else None.
     """
 
     query: View
@@ -120,7 +120,7 @@ class Prepared:
     context: StageContext
     priors: Priors = NO_PRIORS
     is_metric: bool = True
-    implausible_depths: int = 0
+    implausible_depths: KeypointDepths | None = None
 
     @property
     def unit(self) -> str:
@@ -177,13 +177,13 @@ class Coarse:
 
 def _depth_check(prepared: Prepared, support: Support | None) -> DepthCheck:
     """How the query's depth compares with the pose of a support, if it has one; without counts without depth."""
-    if prepared.implausible_depths:
-        return DepthCheck(prepared.implausible_depths, conflict=True)
-    query = prepared.query
-    if query.depths is None:
+    refused = prepared.implausible_depths
+    depths = prepared.query.depths if refused is None else refused
+    if depths is None:
         return NO_DEPTH
     check = support.estimate.depth_check if isinstance(support, PosedSupport) else None
-    return check or DepthCheck(int(np.isfinite(query.depths.depth).sum()))
+    check = check or DepthCheck(int(np.isfinite(depths.depth).sum()), conflict=refused is not None)
+    return replace(check, median=0.0 if np.isnan(depths.median) else depths.median)
 
 
 def prepare(
@@ -210,13 +210,13 @@ def prepare(
     origin = references[0].world_from_camera.translation
     nearby = tuple(replace(r, world_from_camera=r.world_from_camera.shifted(-origin)) for r in references)
     bucket = pipeline.reconstructor.bucket(query, nearby)
-    implausible = 0
+    implausible = None
     if query.photograph is not None and query.photograph.read_depth is not None:
         with context.stage("depth"):
             query = query.with_depths()
             depths = query.depths
             if is_metric and depths is not None and not depths.is_plausible:
-                query, implausible = replace(query, depths=None), int(np.isfinite(depths.depth).sum())
+                query, implausible = replace(query, depths=None), depths
     with context.stage("correspond"):
         correspondences = pipeline.matcher.correspond(
             query, references, check=context.check, query_matches=query_matches

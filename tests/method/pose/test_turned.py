@@ -15,7 +15,7 @@ from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, Matches, PosedView, View
 from mapless_server.method.pairs.stationary import StationaryOptions
 from mapless_server.method.pose.one_reference import Found, MatchedDepths, solve_by_depths
-from mapless_server.method.pose.own_depth import compare_depths
+from mapless_server.method.pose.own_depth import checked, compare_depths
 from mapless_server.method.rejection import Rejection
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
@@ -97,6 +97,14 @@ def test_the_photographs_depth_is_enough(count: int) -> None:
     for seed in range(4):
         given = planted(random_for(seed), Errors(keypoint_px=0.0, depth=NEARLY, common_sigma=0.0), count)
         assert given.off_m(found(given)) < 1e-3
+
+
+def test_points_at_the_photographs_depth_count_as_its_use() -> None:
+    support = checked(found(planted(random_for(5), Errors())).support)
+    check = support.estimate.depth_check
+    assert check is not None
+    assert (check.used, check.compared_count) == (True, 0)
+    assert check.point_count == support.estimate.inliers.sum() > 100
 
 
 def test_exchanged_with_its_reference_it_has_the_inverse_pose() -> None:

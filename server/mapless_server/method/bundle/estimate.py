@@ -46,7 +46,9 @@ class DepthCheck:
         factor: the most probable factor by which the measured depths are longer than those of the pose; 0 for none.
         factor_sigma: its standard deviation, as a share.
         conflict: whether the depths contradict the pose, or their own matches, or cannot be metres.
-        used: whether the depths contributed to the pose.
+        used: whether the depths contributed to the pose: improved it, or gave points.
+        median: median of the whole depth image, in the unit of poses; 0 for none.
+        point_count: inliers on points whose distance these depths give.
     """
 
     keypoint_count: int = 0
@@ -56,6 +58,8 @@ class DepthCheck:
     factor_sigma: float = 0.0
     conflict: bool = False
     used: bool = False
+    median: float = 0.0
+    point_count: int = 0
 
 
 NO_DEPTH = DepthCheck()

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapless.depth import implausible_median
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.lenses import Distortion, Fisheye, RadialTangential, lens_model_of
 from mapless.provenance import GIVEN_POSE, Provenance
@@ -207,14 +208,19 @@ class KeypointDepths:
         relative_sigma: (N,) standard deviation of each depth, as a share of it, above 0.
         common_sigma: standard deviation of the factor that all share, as a share.
         source: where they come from.
-        is_plausible: whether the median of the whole image can be metres.
+        median: the median of the whole image, in the unit of poses; NaN if it is not known.
     """
 
     depth: NDArray[np.float32]
     relative_sigma: NDArray[np.float32]
     common_sigma: float
     source: DepthSource = DepthSource.NETWORK
-    is_plausible: bool = True
+    median: float = np.nan
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether the median can be metres; true if it is not known."""
+        return not implausible_median(self.median)
 
 
 class DepthMap(Protocol):

@@ -32,6 +32,7 @@ from ..judge.two_view import MIN_HULL_SHARE
 from ..options import DoubtOptions
 from ..pairs.stationary import StationaryOptions
 from ..pose.generalized import CameraMatches
+from ..pose.own_depth import at_own_depth
 from ..pose.pnp import MIN_MATCHES, failure_by_chance, log10_false_alarms
 from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection, RejectionReason
@@ -166,7 +167,7 @@ def matched_images_of(images: Sequence[GroupImage]) -> list[MatchedImage]:
 def _support_of(answer: Answer) -> Support | None:
     """The support of an answer; of the points at the photograph's own depth those of an accepted answer's inliers."""
     support = answer.support
-    if support is None or not (own := _at_own_depth(support)).any():
+    if support is None or not (own := at_own_depth(support)).any():
         return support
     kept = ~own
     if isinstance(answer.outcome, Localization) and isinstance(support, PosedSupport):
@@ -179,16 +180,6 @@ def _support_of(answer: Answer) -> Support | None:
     estimate = support.estimate
     estimate = replace(estimate, inliers=estimate.inliers[rows], errors_px=estimate.errors_px[rows])
     return replace(support, estimate=estimate)
-
-
-def _at_own_depth(support: Support) -> NDArray[np.bool_]:
-    """Mask (P,) of the points at the photograph's own depth: one reference observes them, and has no depth there."""
-    structure = support.structure
-    count = len(structure.x_in_world)
-    if support.query.depths is None:
-        return np.zeros(count, bool)
-    own = np.bincount(structure.tracks.point, minlength=count) < 2
-    return own if structure.planes is None else own & ~(structure.planes.information > 0)
 
 
 def _with_points(
@@ -228,7 +219,7 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
         own_pose=own_pose,
         own_covariance=own_covariance,
         match=image.match,
-        at_own_depth=_at_own_depth(support),
+        at_own_depth=at_own_depth(support),
         own_trust=own_trust,
         own_count=own_count,
     )

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from ..bundle.estimate import DepthCheck, PosedSupport, PoseEstimate
+from ..bundle.estimate import DepthCheck, PosedSupport, PoseEstimate, Support
 from ..bundle.pose_problem import DRIFT_INFLATION, USUAL_DRIFT
 from ..bundle.priors import LIKELY_PROBABILITY, conflict_threshold, sharpened
 from ..features.tracks import Tracks
@@ -53,6 +53,7 @@ class DepthComparison:
         jacobian: (n, 6) J.
         spread: standard deviation of ln z over the inliers, robust.
         prior_variance: variance of the factor, of the sensor and of what holds the points.
+        point_count: inliers on points at the query's own depths, which are not compared.
     """
 
     keypoint_count: int
@@ -61,6 +62,7 @@ class DepthComparison:
     jacobian: Array
     spread: float
     prior_variance: float
+    point_count: int = 0
 
     def __len__(self) -> int:
         return len(self.log_ratio)
@@ -79,17 +81,31 @@ class DepthComparison:
             value = float(weight @ self.log_ratio / weight.sum())
         return value, weight
 
+    @property
+    def is_used(self) -> bool:
+        """Whether points are at the query's own depths."""
+        return self.point_count > 0
+
     def check(self, covariance: Array) -> DepthCheck:
         """How the depths compare with a pose of this covariance (6, 6)."""
         if len(self) < MIN_INLIERS:
-            return DepthCheck(self.keypoint_count, len(self))
+            return DepthCheck(self.keypoint_count, len(self), used=self.is_used, point_count=self.point_count)
         factor, weight = self.factor(covariance)
         mean = weight @ self.jacobian / weight.sum()
         agrees = (self.log_ratio - factor) ** 2 < INLIER_SIGMA**2 * self.expected(covariance)
         expected = self.prior_variance + 1 / weight.sum() + float(mean @ covariance @ mean)
         conflict = bool(2 * agrees.sum() < len(self) or factor**2 > conflict_threshold(1) * expected)
         sigma = math.sqrt(1 / weight.sum())
-        return DepthCheck(self.keypoint_count, len(self), int(agrees.sum()), math.exp(factor), sigma, conflict)
+        return DepthCheck(
+            self.keypoint_count,
+            len(self),
+            int(agrees.sum()),
+            math.exp(factor),
+            sigma,
+            conflict,
+            self.is_used,
+            point_count=self.point_count,
+        )
 
     def log10_chance(self, check: DepthCheck) -> float:
         """log10 of the chance that a wrong pose's depths agree so; above 0 where they disagree."""
@@ -121,6 +137,7 @@ def compare_depths(support: PosedSupport) -> DepthComparison | None:
     if depths is None:
         return None
     point, keypoint = support.matches.point[estimate.inliers], support.matches.keypoint[estimate.inliers]
+    point_count = int(at_own_depth(support)[point].sum())
     known = np.isfinite(depths.depth[keypoint])
     point, keypoint = point[known], keypoint[known]
     pose, x_in_world = estimate.world_from_camera, structure.x_in_world[point]
@@ -140,7 +157,16 @@ def compare_depths(support: PosedSupport) -> DepthComparison | None:
         jacobian,
         MAD_TO_SIGMA * float(np.median(np.abs(log_z - median))) if len(z) else 0.0,
         depths.common_sigma**2 + _held(support, point[usable], math.exp(median)),
+        point_count,
     )
+
+
+def at_own_depth(support: Support) -> NDArray[np.bool_]:
+    """Mask (P,) of the points at the photograph's own depth: one reference observes them, and has no depth there."""
+    structure = support.structure
+    if support.query.depths is None or structure.planes is None:  # then points are triangulated, or a network's
+        return np.zeros(len(structure.x_in_world), bool)
+    return ~structure.triangulated & ~(structure.planes.information > 0)
 
 
 def checked(support: PosedSupport) -> PosedSupport:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from mapless.depth import DepthImage, DepthNoise, implausible_median
+from mapless.depth import DepthImage, DepthNoise
 from mapless.geometry import Array, Camera, RigidTransform
 
 from ..features.views import DepthSource, KeypointDepths, View, undistort_pixels
@@ -62,7 +62,7 @@ class MeasuredDepth:
         depth = self.at_pixels(view.camera, view.features.pixels())
         sigma = np.hypot(self.noise.relative_sigma(depth), self.noise.common)
         known, common = (depth.astype(np.float32), sigma.astype(np.float32)), self.noise.common
-        return KeypointDepths(*known, common, DepthSource.MEASURED, not implausible_median(self.median))
+        return KeypointDepths(*known, common, DepthSource.MEASURED, self.median)
 
     def on_grid(self, camera: Camera, count: int) -> tuple[Array, Array]:
         """Pixels (N, 2) of the photograph's camera (a pinhole), on a grid of about so many, and their depths (N,)."""
