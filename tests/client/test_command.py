@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from google.protobuf import json_format
 from support.commands import run_client
+from support.depths import png
 from support.servers import BLACK, CAMERA, PHOTO, RunningServer, pose
 from typer.testing import CliRunner
 
@@ -263,6 +265,19 @@ def test_options_of_a_depth_need_one(
     where = ("--camera", camera_json, "--pose", json.dumps(plain(pose(0.5))))
     code, _, error = run("reference", "add", scene, tmp_path / "view.png", *where, f"--depth-{option[0]}", option[1])
     assert (code, f"--depth-{option[0]} " in error, "--depth, too" in error) == (2, True, True)
+
+
+def test_a_stored_depth_is_shown_without_its_bytes(run: Run, scene: str, tmp_path: Path, camera_json: str) -> None:
+    (tmp_path / "view.png").write_bytes(PHOTO)
+    (tmp_path / "depth.png").write_bytes(png(np.full((64, 96), 1500, np.uint16)))
+    given = ("--camera", camera_json, "--pose", json.dumps(plain(pose(0.5))), "--depth", tmp_path / "depth.png")
+    _, stored, _ = run("reference", "add", scene, tmp_path / "view.png", *given, "--depth-sensor", "stereo")
+    said = {"data": "png", "size": [96, 64], "unit_m": 0.001, "sensor": "stereo", "confidence": False}
+    assert stored["depth"] == stored["depth"] | said
+    _, shown, _ = run("reference", "show", scene, "view")
+    assert (shown["depth"], shown["image"]) == (stored["depth"], None)
+    _, card, _ = run("--text", "reference", "show", scene, "view")
+    assert re.search(r"depth +96x64, unit 0.001 m, sensor stereo\n", card)
 
 
 def test_a_blank_reference_is_warned_of(run: Run, scene: str, tmp_path: Path, camera_json: str) -> None:

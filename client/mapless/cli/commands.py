@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from ..requests import NewReference
 from ..results import Reference, Scene
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import depth_of, limits
-from .output import card, is_confirmed, serving_states, show, table
+from .output import card, is_confirmed, plain, serving_states, show, table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
 
@@ -133,6 +134,8 @@ def add_reference(client: Client, arguments: argparse.Namespace) -> int:
     if not stored.feature_count:
         print(f"mapless: warning: {arguments.photo} is stored, but has no local features: {_BLANK}", file=sys.stderr)
     _warn(stored.warnings)
+    if stored.depth_sha256:
+        stored = replace(stored, depth=reference.depth)
     return show(arguments, stored, _reference_card(stored))
 
 
@@ -177,10 +180,21 @@ def _reference_card(it: Reference) -> list[str]:
         position=" ".join(_position(it.world_from_camera)),
         rotation=f"x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}",
         pose=_pose_of(it.provenance),
+        depth=_depth_of(it),
         features=it.feature_count,
         sha256=it.image_sha256,
         created=_minute(it),
     )
+
+
+def _depth_of(it: Reference) -> str | None:
+    if it.depth is None:
+        return None
+    depth = plain(it.depth)
+    parts = ["x".join(map(str, depth["size"])), f"unit {it.depth.unit_m:g} m", f"sensor {it.depth.sensor.value}"]
+    parts += ["its own noise"] * (it.depth.noise is not None) + ["confidence"] * bool(it.depth.confidence)
+    parts += ["another camera"] * (it.depth.camera is not None or it.depth.camera_from_depth_camera is not None)
+    return ", ".join(parts)
 
 
 def _pose_of(provenance: Provenance) -> str:
@@ -190,8 +204,11 @@ def _pose_of(provenance: Provenance) -> str:
 
 
 def show_reference(client: Client, arguments: argparse.Namespace) -> int:
-    """Prints a reference without its photograph."""
+    """Prints a reference without its photograph; what is known of a depth comes with its bytes alone."""
     found = client.get_reference(arguments.scene, arguments.reference)
+    if found.depth_sha256:
+        whole = client.get_reference(arguments.scene, arguments.reference, include_image=True)
+        found = replace(whole, image=None, mask=None)
     return show(arguments, found, _reference_card(found))
 
 

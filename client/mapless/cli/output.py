@@ -22,8 +22,10 @@ from mapless import wire
 from mapless.answers import LocalizationResult, Rejected
 from mapless.calls.health import SERVICES
 from mapless.client import Client
+from mapless.depth import DepthImage
 from mapless.errors import MaplessError, NotFound
 from mapless.geometry import Camera, RigidTransform
+from mapless.pixels import size_of_image
 
 _NUMBER = re.compile(r"-?[\d.]+")
 
@@ -85,6 +87,10 @@ def plain(value: Any) -> Any:
         return json_format.MessageToDict(
             value, preserving_proto_field_name=True, always_print_fields_with_no_presence=True
         )
+    if isinstance(value, DepthImage):  # without its bytes
+        numbers = {it.name: plain(getattr(value, it.name)) for it in dataclasses.fields(value)}
+        form, size = ("png", size_of_image(value.data, "depth")) if value.size is None else ("float32", value.size)
+        return numbers | {"data": form, "confidence": bool(value.confidence), "size": list(size)}
     if dataclasses.is_dataclass(value):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, dict):
