@@ -1,16 +1,20 @@
 """The depth of references as coloured points, for pictures of scenes: few enough to be sent, and without edges."""
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapless import Reference
+from mapless.depth import implausible_median
 from mapless.geometry import Array
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ANY_SIZE, decode_depth
-from mapless_server.method.structure.measured_depth import MeasuredDepth
+from mapless_server.method.structure.measured_depth import MeasuredDepth, median_depth
 from mapless_tools.matches import Picture, colours_at
+
+log = logging.getLogger(__name__)
 
 DEPTH_POINTS, MAX_OF_REFERENCE = 200_000, 20_000
 """Points by depth in a picture of a scene, at most, and of one reference: some megabytes, which a browser draws."""
@@ -32,10 +36,13 @@ def share_of(reference_count: int) -> int:
     return min(MAX_OF_REFERENCE, DEPTH_POINTS // max(reference_count, 1))
 
 
-def depth_points(reference: Reference, picture: Picture, max_count: int) -> ColouredPoints | None:
+def depth_points(
+    reference: Reference, picture: Picture, max_count: int, is_metric: bool = True
+) -> ColouredPoints | None:
     """The depth of a reference, evenly thinned to so many points, in the colours of its photograph, possibly reduced.
 
-    None without depth, or if it cannot be used.
+    None without depth, or if it cannot be used; one that a server does not use, because it cannot be metres where the
+    scene's unit is the metre, is named in the log.
     """
     depth, photo = reference.depth, reference.camera
     if depth is None or max_count < 1:
@@ -43,6 +50,9 @@ def depth_points(reference: Reference, picture: Picture, max_count: int) -> Colo
     try:
         values = decode_depth(depth, (photo.width_px, photo.height_px), ANY_SIZE)
     except InvalidArgument:
+        return None
+    if is_metric and (text := implausible_median(median_depth(values))):
+        log.warning("the depth of reference %r is left out: its median is %s", reference.reference_id, text)
         return None
     camera = depth.camera or photo.resized(values.shape[1], values.shape[0])
     points = MeasuredDepth(camera, thinned(without_edges(values), max_count), depth.known_noise).points()

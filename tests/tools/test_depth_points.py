@@ -60,6 +60,15 @@ def test_a_reference_without_usable_depth_has_no_points(depth: DepthImage | None
     assert depth_points(reference(depth), picture(), 5000) is None
 
 
+def test_millimetres_taken_for_metres_are_left_out_with_a_note(caplog: pytest.LogCaptureFixture) -> None:
+    depth = replace(DepthImage(png(np.full((240, 320), 2000, np.uint16)), 0.001), unit_m=1.0)
+    assert depth_points(reference(depth), picture(), 5000) is None
+    assert caplog.messages == ["the depth of reference 'r' is left out: its median is 2000 m, outside 0.05 to 200 m"]
+    drawn = depth_points(reference(depth), picture(), 5000, is_metric=False)
+    assert drawn is not None
+    assert np.median(POSE.inverse().apply(drawn.points)[:, 2]) == pytest.approx(2000)
+
+
 def test_edges_have_no_points_and_slanted_floors_do() -> None:
     depth = np.tile(np.linspace(1, 4, 240, dtype=np.float32)[:, None], (1, 320))
     depth[:, 160:] = 0.5

@@ -79,7 +79,7 @@ def export_gltf(client: Client, scene: str, folder: Path, progress: Progress) ->
             return View(reference)
         points = _points(client, scene, reference, image) if next(left, None) is not None else (None, None)
         small = thumbnail(np.ascontiguousarray(image[..., ::-1]))
-        return View(reference, small, *points, depth_points(reference, image, share))
+        return View(reference, small, *points, depth_points(reference, image, share, not known.arbitrary_unit))
 
     views, damaged = fetch_all(client, scene, take, progress, PICTURES)
     if views:

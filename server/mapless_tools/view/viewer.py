@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from mapless import Client, ConnectOptions, MaplessError, Reference
+from mapless import Scene as KnownScene
 from mapless_server.errors import InvalidArgument
 from mapless_tools.depth_points import depth_points, share_of
 from mapless_tools.matches import colours_at, read_picture
@@ -40,7 +41,8 @@ def viewer(
     """
     with ExitStack() as stack:
         client = stack.enter_context(Client(address, connect))
-        scenery = lay_out(client.get_scene(scene), list(client.list_references(scene)), max_pictured)
+        known = client.get_scene(scene)
+        scenery = lay_out(known, list(client.list_references(scene)), max_pictured)
 
         def open_photo(reference_id: str) -> bytes:
             return client.get_reference(scene, reference_id, include_image=True).image or b""
@@ -48,7 +50,7 @@ def viewer(
         server = GuardedViser(host, port, f"mapless: {scene}")
         stack.callback(server.stop)
         stage = Stage(server, scenery, scene, open_photo)
-        work = _Background(client, scene, scenery, stage)
+        work = _Background(client, known, scenery, stage)
         stack.callback(work.close)
         feed = Feed(address, connect, scene, work.show_query, stage.report)
         stack.callback(feed.close)
@@ -59,8 +61,9 @@ def viewer(
 class _Background:
     """Fills the stage after it is shown: photographs on frustums, points, and live queries."""
 
-    def __init__(self, client: Client, scene: str, scenery: Scenery, stage: Stage) -> None:
-        self._client, self._scene, self._scenery, self._stage = client, scene, scenery, stage
+    def __init__(self, client: Client, scene: KnownScene, scenery: Scenery, stage: Stage) -> None:
+        self._client, self._scene, self._scenery, self._stage = client, scene.scene_id, scenery, stage
+        self._is_metric = not scene.arbitrary_unit
         # One call at a time: the server has other clients.
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="view")
         self._closing = threading.Event()
@@ -97,7 +100,7 @@ class _Background:
         picture = read_picture(stored.image or b"", 4 * THUMBNAIL_PX)
         small = read_picture(stored.image or b"", THUMBNAIL_PX)
         self._stage.show_picture(reference.reference_id, small)
-        found = depth_points(stored, picture, share_of(len(self._scenery.pictured)))
+        found = depth_points(stored, picture, share_of(len(self._scenery.pictured)), self._is_metric)
         if found is not None:
             self._stage.show_depth(reference.reference_id, found)
 
