@@ -24,10 +24,7 @@ from numpy.typing import NDArray
 from mapless.depth import DepthImage, DepthNoise
 from mapless.geometry import Array, Camera, RigidTransform
 
-from ..features.views import DepthSource, KeypointDepths, View, undistort_pixels
-
-LATTICE = 257
-"""Pixels along each side of a depth image that are undistorted; lenses are smooth between."""
+from ..features.views import ALONG_SIDE, DepthSource, KeypointDepths, View, undistort_pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +142,10 @@ class MeasuredDepth:
 def _undistorted(
     columns: NDArray[np.float32], rows: NDArray[np.float32], camera: Camera
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Undistorted columns and rows (H, W) of the pixels at columns (W,) and rows (H,), exact on a lattice.
+    """Undistorted columns and rows (H, W) of the pixels at columns (W,) and rows (H,).
 
-    Of a lattice of `LATTICE` by as many, between which a lens is linear to hundredths of a pixel.
+    They are exact on a lattice of `ALONG_SIDE` squared positions along a side, between which lenses are linear to
+    hundredths of a pixel.
     """
     knots, lower, share = zip(*(_lattice(it) for it in (columns, rows)), strict=True)
     pixels = np.stack(np.meshgrid(*knots), axis=-1).reshape(-1, 2).astype(np.float64)
@@ -158,8 +156,8 @@ def _undistorted(
 
 
 def _lattice(positions: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.intp], NDArray[np.float32]]:
-    """At most `LATTICE` of sorted positions, and for each position the one before and the share of the way on."""
-    chosen = np.unique(np.linspace(0, len(positions) - 1, min(LATTICE, len(positions))).round().astype(np.intp))
+    """At most `ALONG_SIDE` squared of sorted positions; for each position the one before and the share of the way."""
+    chosen = np.unique(np.linspace(0, len(positions) - 1, min(ALONG_SIDE**2, len(positions))).round().astype(np.intp))
     knots = positions[chosen]
     lower = np.clip(np.searchsorted(knots, positions, side="right") - 1, 0, max(0, len(knots) - 2))
     return knots, lower, (positions - knots[lower]) / np.diff(knots)[lower]
