@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -134,7 +135,7 @@ def fill(data_dir: Path) -> None:
 @pytest.fixture(autouse=True)
 def needed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The demo's photographs match so many triangulated points that depths would not be used."""
-    monkeypatch.setattr(kept_depth, "vote", lambda *_: [])
+    monkeypatch.setattr(kept_depth, "vote", lambda *_: SimpleNamespace(point=np.zeros(0, np.intp)))
 
 
 @pytest.fixture(scope="module")
