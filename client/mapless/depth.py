@@ -3,17 +3,22 @@
 import hashlib
 import json
 import math
+import os
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from . import wire
 from .geometry import Camera, RigidTransform
 from .lenses import lens_model_of
 from .v1 import geometry_pb2 as pb
 from .wire import FieldError, joined
+
+Source = bytes | str | os.PathLike[str]
+"""Bytes, or the path of their file."""
 
 _SENSORS: wire.ProtoEnum = pb.DepthSensor
 
@@ -103,7 +108,7 @@ NOISE = {
 """Noise by the kind of sensor; docs/guides/depth.md has the sources."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class DepthImage:
     """A depth image as its sensor gave it.
 
@@ -111,15 +116,18 @@ class DepthImage:
     PNG also 65535, and as float32 also NaN or infinity.
 
     Attributes:
-        data: the bytes of a PNG with one channel of 16 bits; or float32 values, little-endian, row by row.
+        data: the bytes of a PNG with one channel of 16 bits; or float32 values, little-endian, row by row. Made from
+            them, or from the path of their file, which is read.
         unit_m: length of 1 in these values, metres: 0.001 for millimetres.
         size: width and height of float32 values, pixels; None for a PNG.
         sensor: the kind of sensor, which gives the noise.
         camera: the depth camera, in pixels of the depth image; None: the photograph's own, scaled to its size.
         camera_from_depth_camera: pose of the depth camera in the photograph's camera, metres; None: they are the same.
-        confidence: the bytes of a PNG with one channel of 8 bits, of the same size; empty for none.
+        confidence: the bytes of a PNG with one channel of 8 bits, of the same size, or its path; empty for none.
         min_confidence: depths with a smaller confidence are not used.
         noise: the sensor's noise, in place of that of its kind.
+
+    OSError if a file cannot be read; TypeError for pixels.
     """
 
     data: bytes
@@ -132,13 +140,30 @@ class DepthImage:
     min_confidence: int = 1
     noise: DepthNoise | None = None
 
+    def __init__(
+        self,
+        data: Source,
+        unit_m: float,
+        size: tuple[int, int] | None = None,
+        sensor: DepthSensor = DepthSensor.UNKNOWN,
+        camera: Camera | None = None,
+        camera_from_depth_camera: RigidTransform | None = None,
+        confidence: Source = b"",
+        min_confidence: int = 1,
+        noise: DepthNoise | None = None,
+    ) -> None:
+        vars(self).update(data=_read(data, "data"), unit_m=unit_m, size=size, sensor=sensor, camera=camera)
+        vars(self).update(camera_from_depth_camera=camera_from_depth_camera, noise=noise)
+        vars(self).update(confidence=_read(confidence, "confidence"), min_confidence=min_confidence)
+
     @staticmethod
-    def of_metres(depth_m: NDArray[np.float32], sensor: DepthSensor = DepthSensor.UNKNOWN) -> "DepthImage":
+    def of_metres(depth_m: ArrayLike, sensor: DepthSensor = DepthSensor.UNKNOWN) -> "DepthImage":
         """The image of depths (H, W) in metres, of the photograph's own camera. ValueError for another shape."""
-        if depth_m.ndim != 2:
-            raise ValueError(f"depth_m must have rows and columns, has the shape {depth_m.shape}")
-        height, width = depth_m.shape
-        return DepthImage(np.ascontiguousarray(depth_m, "<f4").tobytes(), 1.0, (width, height), sensor)
+        values = np.ascontiguousarray(depth_m, "<f4")
+        if values.ndim != 2:
+            raise ValueError(f"depth_m must have rows and columns, has the shape {np.shape(depth_m)}")
+        height, width = values.shape
+        return DepthImage(values.tobytes(), 1.0, (width, height), sensor)
 
     @property
     def known_noise(self) -> DepthNoise:
@@ -201,7 +226,7 @@ def depth_to_message(depth: DepthImage, field: str = "depth") -> pb.DepthImage:
         message.png = depth.data
     else:
         message.float32 = depth.data
-        message.width_px, message.height_px = depth.size
+        message.width_px, message.height_px = _checked_size(depth.size, joined(field, "size"))
     if depth.camera is not None:
         message.intrinsics.CopyFrom(wire.camera_to_message(depth.camera, joined(field, "camera")))
     if depth.camera_from_depth_camera is not None:
@@ -243,6 +268,25 @@ def depth_from_message(message: pb.DepthImage, field: str) -> DepthImage:
     if message.HasField("noise"):
         depth = replace(depth, noise=_noise_from_message(message.noise, joined(field, "noise")))
     return depth
+
+
+def _read(source: Source, field: str) -> bytes:
+    if isinstance(source, bytes):
+        return source
+    try:
+        path = Path(source)
+    except TypeError:
+        text = f"{field} is bytes or the path of a file, not {type(source).__qualname__}: of_metres takes an array"
+        raise TypeError(text) from None
+    return path.read_bytes()
+
+
+def _checked_size(size: tuple[int, int], field: str) -> tuple[int, int]:
+    if len(size) != 2 or not all(isinstance(it, int | np.integer) for it in size):
+        raise FieldError(field, f"must be width and height in whole pixels, is {size!r}")
+    if not all(wire.MIN_SIDE_PX <= it <= wire.MAX_SIDE_PX for it in size):
+        raise FieldError(field, f"must be {wire.MIN_SIDE_PX} to {wire.MAX_SIDE_PX} pixels a side, is {size!r}")
+    return int(size[0]), int(size[1])
 
 
 def _size_from_message(message: pb.DepthImage, field: str) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """Depth images as messages: nothing is lost, and numbers out of range are named."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -109,3 +110,27 @@ def test_numbers_out_of_range_are_named(message: pb.DepthImage, field: str) -> N
     with pytest.raises(FieldError) as raised:
         depth_from_message(message, "depth")
     assert raised.value.field == f"depth.{field}"
+
+
+def test_a_depth_is_made_from_the_path_of_its_file(tmp_path: Path) -> None:
+    (tmp_path / "depth.png").write_bytes(b"values")
+    (tmp_path / "sure.png").write_bytes(b"confidence")
+    read = DepthImage(tmp_path / "depth.png", 0.001, confidence=str(tmp_path / "sure.png"))
+    assert read.sha256 == DepthImage(b"values", 0.001, confidence=b"confidence").sha256
+    with pytest.raises(FileNotFoundError):
+        DepthImage("lost.png", 0.001)
+    with pytest.raises(TypeError, match="data is bytes or the path of a file, not ndarray: of_metres"):
+        DepthImage(np.ones((48, 64)), 0.001)  # type: ignore[arg-type]
+
+
+def test_rows_of_metres_are_a_depth() -> None:
+    rows = [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
+    assert DepthImage.of_metres(rows).sha256 == DepthImage.of_metres(np.array(rows, np.float32)).sha256
+    with pytest.raises(ValueError, match="rows and columns"):
+        DepthImage.of_metres([1.0, 2.0])
+
+
+@pytest.mark.parametrize("size", [(2**33, 480), (640.5, 480), (640, 16), (640,)])
+def test_a_size_that_is_none_is_named(size: tuple[int, int]) -> None:
+    with pytest.raises(FieldError, match=r"depth\.size: must be"):
+        depth_to_message(DepthImage(b"", 1.0, size), "depth")

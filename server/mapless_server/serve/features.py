@@ -12,6 +12,7 @@ from pathlib import Path
 from mapless_server.choices import AUTO, BEST_VARIANTS, OFF, STORED
 from mapless_server.engine.query import Tier
 from mapless_server.extras import install_hint
+from mapless_server.kernels import nearest
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import FeatureExtractor, make_extractor
 from mapless_server.method.features.extractors.options import ALIKED_VARIANT, LearnedOptions
@@ -27,6 +28,9 @@ from .deferred import DeferredExtractor, DeferredPairMatching
 from .devices import choose_device
 
 log = logging.getLogger(__name__)
+
+DESCRIPTOR_LENGTH = 64
+"""Numbers of the descriptors that are stored as int8."""
 
 WITHOUT_WEIGHTS = "sift"
 """The features that need nothing."""
@@ -84,6 +88,8 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
         for name in extractors
     }
     _log_features(settings, extractors, missing)
+    compiled = nearest.is_available(DESCRIPTOR_LENGTH)
+    log.info("descriptors of int8 are compared by %s", "compiled code" if compiled else "numpy, in more time")
     reconstructor = make_reconstructor(
         settings.backend,
         settings.weights_dir,
