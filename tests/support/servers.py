@@ -166,7 +166,7 @@ def whole(localize: Callable[..., Answer]) -> Method:
 
     def prepare(*arguments: Any) -> Any:
         *asked, context, _, _, _ = arguments  # query matches, priors and unit do not matter
-        return SimpleNamespace(asked=asked, context=context, bucket="stand-in", prepared=None)
+        return SimpleNamespace(asked=asked, context=context, bucket="stand-in", prepared=SimpleNamespace(has_depth=False))
 
     def solve(coarse: Any, attempt: Attempt, doubt: DoubtOptions) -> Found:
         """Wide matches and lines change nothing, so they find nothing else."""
