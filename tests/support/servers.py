@@ -166,7 +166,8 @@ def whole(localize: Callable[..., Answer]) -> Method:
 
     def prepare(*arguments: Any) -> Any:
         *asked, context, _, _, _ = arguments  # query matches, priors and unit do not matter
-        return SimpleNamespace(asked=asked, context=context, bucket="stand-in", prepared=SimpleNamespace(has_depth=False))
+        without_depth = SimpleNamespace(has_depth=False)
+        return SimpleNamespace(asked=asked, context=context, bucket="stand-in", prepared=without_depth)
 
     def solve(coarse: Any, attempt: Attempt, doubt: DoubtOptions) -> Found:
         """Wide matches and lines change nothing, so they find nothing else."""
