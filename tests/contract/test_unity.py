@@ -161,7 +161,7 @@ class Program {
 
 @needs_mono
 def test_depth_is_sent_as_float_metres(tmp_path: Path) -> None:
-    """Of ARCore's millimetres with padded rows, of a texture whose bottom row is first, of ARKit's metres."""
+    """Planes of ARCore's millimetres with padded rows, of a texture whose bottom row is first, of ARKit's metres."""
     declared = ("public static DepthImage DepthMetres", "public static float[] DepthPlane")
     found = printed(tmp_path, _DEPTH.replace("PARTS", "\n".join(part(it, "\n        }\n") for it in declared)))
     top, bottom = np.array([1.0, 0.0], "<f4"), np.array([0.5, 2.0], "<f4")

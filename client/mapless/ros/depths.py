@@ -27,7 +27,7 @@ _VALUES = {MILLIMETRES: "u2", "mono16": "u2", METRES: "f4"}
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TRANSPORT = "compressedDepth"
 _HEADER = struct.Struct("<iff")
-"""Of `compressedDepth`: a format, and two numbers by which inverse depths were quantized."""
+"""The header of `compressedDepth`: a format, and two numbers by which inverse depths were quantized."""
 
 Values = NDArray[np.uint16] | NDArray[np.float32]
 

@@ -29,7 +29,7 @@ CONTRAST_EPSILON = 1e-5
 """Added to the variance of a photograph, which may be of one colour."""
 
 OPSET, IR_VERSION = 17, 8
-"""Of ONNX; ONNX Runtime reads them since 1.12."""
+"""Versions of ONNX, which ONNX Runtime reads since 1.12."""
 
 
 class OnnxEdgePoint2:

@@ -17,7 +17,7 @@ from mapless_server.method.features.views import Ignored, Matches, View
 
 
 class Named(Protocol):
-    """What has a name."""
+    """A value with a name."""
 
     @property
     def name(self) -> str:

@@ -1,4 +1,4 @@
-"""What an import says of depths that nothing else shows before photographs are localized: their unit and sensor."""
+"""Notes of an import on depths that nothing else shows before photographs are localized: their unit and sensor."""
 
 from collections.abc import Sequence
 

@@ -152,7 +152,7 @@ def test_radii_contain_the_factors_error() -> None:
 
 @pytest.mark.parametrize("with_depth", [60, 80])
 def test_radii_contain_the_factor_of_some_references(with_depth: int) -> None:
-    """Of two references at a place one has depths, whose factor is much better known than the photograph's own."""
+    """One of two references at a place has depths, whose factor is much better known than the photograph's own."""
     inside = []
     for seed in range(60):
         random = random_for("some references", seed)

@@ -82,7 +82,7 @@ def _passing(
 
 
 def _once(nearest: NDArray[np.integer], mutual: NDArray[np.bool_], columns: int) -> NDArray[np.bool_]:
-    """Which rows (N,) are not tied with another one that is as near to the same column."""
+    """Mask (N,) of the rows that are not tied with another one that is as near to the same column."""
     return np.asarray(np.bincount(nearest[mutual], minlength=columns)[nearest] == 1)
 
 

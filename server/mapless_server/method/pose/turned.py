@@ -103,7 +103,7 @@ class TurnedMatches:
 
     @cached_property
     def _cameras(self) -> tuple[Array, Array, Array, Array]:
-        """Of each match focal lengths and principal point (T, 2), and camera_from_world (T, 3, 3), (T, 3)."""
+        """Focal lengths and principal point (T, 2), and camera_from_world (T, 3, 3), (T, 3), of each match."""
         cameras, poses = zip(*((it.view.camera, it.world_from_camera.inverse()) for it in self.references), strict=True)
         focal = np.array([(it.focal_x_px, it.focal_y_px) for it in cameras])
         principal = np.array([(it.principal_x_px, it.principal_y_px) for it in cameras])

@@ -297,7 +297,7 @@ class _Compared:
         return float(np.mean(np.abs(residual) <= AGREEING_SIGMA)) if len(residual) else 0.0
 
     def _gains(self) -> list[tuple[int, float, float]]:
-        """What readings gain over the given one, in standard deviations, of all places and of triangulated ones."""
+        """Gains of readings over the given one, in standard deviations, of all places and of triangulated ones."""
         spread = max(ERROR_SLOPE, float(np.std(np.log(self.seen.depth))))
         densities = _log_densities(self.residual, self.sigma, spread)
         gains = np.where(self._may_be_hidden, np.nan, densities - densities[0])

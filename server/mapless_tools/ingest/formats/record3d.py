@@ -3,7 +3,7 @@
 metadata.json has `poses`, for each number qx qy qz qw tx ty tz of world_from_camera with OpenGL's camera axes, the size
 `w`, `h` and `K`, column by column, of the image as it is stored, and in newer exports `perFrameIntrinsicCoeffs`, for
 each number fx fy cx cy. Numbers of photographs may be missing. A depth is metres in one channel, with fewer pixels; it
-has a value everywhere, so that what was measured cannot be told from what was filled in. Principal points count from
+has a value everywhere, so that measured and filled-in values look alike. Principal points count from
 the corner of the top-left pixel, as Apple's. (From an export; Record3D has no document of it.)
 
 Not read are .r3d files, whose depths are compressed by LZFSE: export "EXR + RGB" from the app.
