@@ -20,7 +20,7 @@ pytestmark = pytest.mark.realdata
 STEP = 2
 """Frames between two of a pair."""
 MIN_SINE = 0.026
-"""Of the angle between two rays: 1.5 degrees, below which a point's depth is uncertain by tens of per cent."""
+"""Sine of the angle between two rays, 1.5 degrees, below which a point's depth is uncertain by tens of per cent."""
 
 
 def points_of(frame: Frame) -> MeasuredDepth:

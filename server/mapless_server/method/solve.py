@@ -36,7 +36,7 @@ from .judge.two_view import (
 )
 from .options import DoubtOptions, Variant
 from .pipeline import Coarse, structure_and_matches, unverified, wide_correspondences, with_wide_correspondences
-from .pose.one_reference import MatchedDepths, solve_by_depths
+from .pose.by_depths import MatchedDepths, solve_by_depths
 from .pose.own_depth import checked, contradicted, improved
 from .pose.pnp import gate_failure, solve_pose
 from .pose.two_view import TwoViewOptions, solve_two_view

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DepthOptions:
-    """What is used of the depths of a folder, and what its layout does not say of them; each field is a flag.
+    """Use of the depths of a folder, and what its layout does not say of them; each field is a flag.
 
     `depth_sensor` and `depth_unit` replace the layout's own; the unit is the length of 1 in the values of a depth, in
     the folder's unit of length. `depth_topic` is of a recording.

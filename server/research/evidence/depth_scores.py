@@ -14,7 +14,7 @@ from mapless_server.engine.query import Tier
 from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.judge import LEVELS, MAX_ONE_REFERENCE_RADIUS_SHARE
-from mapless_server.method.pose.one_reference import Found, MatchedDepths, solve_by_depths
+from mapless_server.method.pose.by_depths import Found, MatchedDepths, solve_by_depths
 from mapless_server.serve.features import make_tiers
 from mapless_server.settings import load_settings
 from mapless_tools.ingest.formats.cameras import read_folder

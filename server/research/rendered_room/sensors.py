@@ -56,7 +56,7 @@ class Scan:
 
     @staticmethod
     def of(room: Room, camera: Camera, world_from_camera: RigidTransform) -> "Scan":
-        """What a camera sees of the room."""
+        """The room as a camera sees it."""
         inverse_depth, quad = cast(room, camera, world_from_camera)
         pixels = np.indices(quad.shape)[::-1].reshape(2, -1).T.astype(float)
         rays = camera.rays(pixels) @ world_from_camera.rotation.T

@@ -14,7 +14,7 @@ from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate, solve_rig
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.pairs.stationary import StationaryOptions
-from mapless_server.method.pose.one_reference import Found, MatchedDepths, solve_by_depths
+from mapless_server.method.pose.by_depths import Found, MatchedDepths, solve_by_depths
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.structure.match import MatchOptions
 from mapless_server.method.structure.model import ScaleSource

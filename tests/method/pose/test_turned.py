@@ -14,7 +14,7 @@ from mapless.geometry import Array, Camera, RigidTransform, rotation_from_vector
 from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.features.views import DepthSource, Features, KeypointDepths, Matches, PosedView, View
 from mapless_server.method.pairs.stationary import StationaryOptions
-from mapless_server.method.pose.one_reference import Found, MatchedDepths, solve_by_depths
+from mapless_server.method.pose.by_depths import Found, MatchedDepths, solve_by_depths
 from mapless_server.method.pose.own_depth import checked, compare_depths
 from mapless_server.method.rejection import Rejection
 

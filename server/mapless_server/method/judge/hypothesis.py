@@ -47,7 +47,7 @@ class Solver(Enum):
     LINES = "lines"
     """Matches with single references and 2D-3D matches together, see `pose.two_view`."""
     DEPTHS = "depths"
-    """Matches with depths in the photograph or in references, see `pose.one_reference`."""
+    """Matches with depths in the photograph or in references, see `pose.by_depths`."""
 
 
 @dataclass(frozen=True)

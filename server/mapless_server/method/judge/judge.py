@@ -36,7 +36,7 @@ from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 from ..bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance, with_halves
 from ..features.limits import INEXACT_INLIER_PX
 from ..optim.optimize import pose_hessian, world_covariance
-from ..pose.one_reference import Found
+from ..pose.by_depths import Found
 from ..pose.pnp import LN_10, MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 from .cameras import wrong_camera, wrong_intrinsics

@@ -38,7 +38,7 @@ from ..structure.depth_mistakes import FITTING_SHARE
 from ..structure.kept_depth import REGIONS
 from ..structure.model import Structure
 from ..structure.structure import observe
-from .one_reference import INLIER_SIGMA, ITERATIONS, MIN_INLIERS
+from .depth_problem import INLIER_SIGMA, ITERATIONS, MIN_INLIERS
 from .pnp import LN_10
 
 

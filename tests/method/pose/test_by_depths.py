@@ -18,7 +18,7 @@ from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pairs.correspond import Correspondences, Matcher
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.method.pose import one_reference
+from mapless_server.method.pose import depth_problem
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.structure.model import ScaleSource, ScaleStage
 
@@ -143,9 +143,9 @@ def test_one_reference_is_enough_within_the_networks_metre(monkeypatch: pytest.M
     A hundred trials, so that the share is known to 5 %. Errors of keypoints and single depths average out here, and the
     reference's pose has none; on photographs it is not so, which the radii allow for otherwise.
     """
-    monkeypatch.setattr(one_reference, "SHARED_MATCHES", 1e9)
-    monkeypatch.setattr(one_reference, "USUAL_OWN", 0.0)
-    monkeypatch.setattr(one_reference, "USUAL_DRIFT", 0.0)
+    monkeypatch.setattr(depth_problem, "SHARED_MATCHES", 1e9)
+    monkeypatch.setattr(depth_problem, "USUAL_OWN", 0.0)
+    monkeypatch.setattr(depth_problem, "USUAL_DRIFT", 0.0)
     shares, holds = list[tuple[float, float]](), list[bool]()
     for trial in range(100):
         given = planted(random_for("one reference", trial), Errors())
