@@ -1,11 +1,13 @@
 """The warm-up localizes a rendered photograph of known pose; a failure ends the start with one sentence."""
 
+import asyncio
 import signal
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -33,7 +35,7 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import Result, Tier
+from mapless_server.engine.query import Caller, Result, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.engine.search import SearchJob
 from mapless_server.engine.stages import Method
@@ -63,7 +65,7 @@ async def warm(folder: Path, tiers: Sequence[Tier], method: Method | None = None
         try:
             yield engine
             await warm_up(engine)
-            await warm_up_stronger(engine)
+            await warm_up_stronger(engine, quiet_s=0.0)
         finally:
             await engine.close()
 
@@ -94,6 +96,26 @@ async def test_every_tier_describes_the_references(tmp_path: Path) -> None:
     async with warm(tmp_path, tiers, whole(lambda *_: answer_at(TRUTH))):
         pass
     assert [len(extractor.seen) for extractor in extractors] == [3 + ROUNDS, 2]
+
+
+async def test_stronger_features_wait_for_an_idle_queue(tmp_path: Path) -> None:
+    stronger, ends = StandInExtractor("stronger"), threading.Event()
+    tiers = [Tier(it, Pipeline(cast(Any, StandInReconstructor()))) for it in (StandInExtractor(), stronger)]
+    with Store.open(tmp_path) as store:
+        engine = engine_over(store, tiers, EngineOptions(), Parts(method=whole(lambda *_: answer_at(TRUTH))))
+        try:
+            await warm_up(engine)
+            caller = Caller(Flow("", "robot"), time.monotonic() + LIMIT_S)
+            computing = asyncio.ensure_future(engine.join(partial(ends.wait, LIMIT_S), caller))
+            loading = asyncio.ensure_future(warm_up_stronger(engine, quiet_s=0.1))
+            await asyncio.sleep(0.3)
+            assert not stronger.seen
+            ends.set()
+            assert await computing
+            await loading
+            assert stronger.seen
+        finally:
+            await engine.close()
 
 
 def answer_at(centre: NDArray[np.float64]) -> Answer:
@@ -195,6 +217,7 @@ def test_stronger_features_that_fail_are_logged_while_serving(
 ) -> None:
     stronger = StandInExtractor("stronger")
     monkeypatch.setattr(stronger, "extract", raising(RuntimeError("no kernel image")))
+    monkeypatch.setattr("mapless_server.serve.running.QUIET_S", 0.0)
     settings = Settings(host="127.0.0.1", port=0, data_dir=tmp_path, metrics=False)
     make = engine_of(lambda *_: answer_at(TRUTH), stronger=stronger)
     with listening(settings, Store.open(tmp_path), make) as (running, _):

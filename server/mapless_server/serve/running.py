@@ -39,7 +39,7 @@ from mapless_server.settings import Settings
 from mapless_server.store import Store
 
 from .assembly import MakeEngine, StartupError, make_engine, open_store, what_is_missing
-from .warm_up import warm_up, warm_up_stronger
+from .warm_up import QUIET_S, warm_up, warm_up_stronger
 
 if TYPE_CHECKING:
     from mapless_server.observability.otlp import OtlpTracer
@@ -257,7 +257,7 @@ async def _start(
     await _warm_up(settings, engine, metrics)
     await services.open(engine)
     if settings.warm_up:
-        _run_task(stack, warm_up_stronger(engine))
+        _run_task(stack, warm_up_stronger(engine, QUIET_S))
     if engine.background is not None:
         engine.background.start(settings.background_matching)
         stack.push_async_callback(asyncio.to_thread, engine.background.close)
