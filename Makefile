@@ -101,8 +101,8 @@ demo-video: setup  ## From a video of a room with a printed tag to localized pho
 bench: setup  ## Measure accuracy and latency on the real scenes; DATA=folder with the scenes
 	$(FROM_HERE) $(BIN)/python -m bench $(if $(DATA),'$(DATA)',../shared/data)
 
-bench-turns: setup  ## Compare what a query costs two commits, by turns in one run: BEFORE=commit AFTER=commit (or the working tree)
-	$(FROM_HERE) $(BIN)/python -m bench.turns '$(BEFORE)' '$(AFTER)' $(if $(DATA),--data '$(DATA)') $(ARGS)
+bench-turns: setup  ## Compare two commits by turns in one run: BEFORE=commit AFTER=commit or the working tree; WHAT="import start saturation"
+	$(FROM_HERE) $(BIN)/python -m bench.turns '$(BEFORE)' '$(AFTER)' $(if $(DATA),--data '$(DATA)') $(WHAT:%=--what %) $(ARGS)
 
 bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can measure
 	$(FROM_HERE) $(BIN)/python -m bench.network $(ARGS)

@@ -18,7 +18,9 @@ from bench.network.forward import Forward, max_difference
 from bench.network.planted import UNITS_PER_METRE, PlantedReconstructor, Truth, true_points
 from bench.network.report import Figure
 from bench.network.subject import AnySizes, Work, flop_of, make_network
-from bench.turns import Measured, main, ratio_with_interval, report
+from bench.turns.command import main
+from bench.turns.comparison import figures_of_turns, ratio_with_interval, table
+from bench.turns.query import Measured, agreement, figures_of
 from mapless.geometry import Camera
 from mapless_server.choices import NETWORKS
 from mapless_server.method.coarse import reconstruct_one
@@ -150,9 +152,14 @@ def test_a_planted_ratio_lies_in_its_interval() -> None:
 
 def test_a_rejected_photograph_counts_for_the_time_alone() -> None:
     times = np.array([[0.2, 0.2], [0.1, 0.1]])
-    lines = report([Measured(times, times, 1e-9), Measured(times, times, None)], ("a", "b"))
-    assert "| processor time | 200.0 | 100.0 | 0.500 | 0.500 to 0.500 |" in lines
-    assert lines[-1] == "Localized by both: 1, at most 1e-09 (unit of the scene) apart."
+    measured = [Measured(times, times, 1e-9), Measured(times, times, None)]
+    assert "| warm query, processor time, ms | 200 | 100 | 0.500 | 0.500 to 0.500 |" in table(figures_of(measured))
+    assert agreement(measured) == "Localized by both: 1, at most 1e-09 (unit of the scene) apart."
+
+
+def test_turns_of_the_same_number_are_compared() -> None:
+    first, second = figures_of_turns([("a", "s"), ("b", "")], [[[1, 10], [2, 20]], [[3, 30], [4, 40]]])
+    assert (first.values.tolist(), second.values.tolist()) == ([[1, 3], [2, 4]], [[10, 30], [20, 40]])
 
 
 def test_without_a_commit_nothing_is_measured(capsys: pytest.CaptureFixture[str]) -> None:
