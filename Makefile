@@ -43,8 +43,8 @@ lock: $(VENV)/.installed  ## Write the versions of all packages anew after a cha
 	$(BIN)/python .ci/lock.py $(TORCH_VERSION) $(if $(UPGRADE),--upgrade)
 	cd client/web && npm install --package-lock-only --ignore-scripts --no-audit --no-fund
 
-# The module that is compiled, in place. Without a compiler numpy computes the same in more time.
-COMPILED := server/mapless_server/kernels/_nearest.abi3.so
+# The modules that are compiled, in place. Without a compiler numpy computes the same in more time.
+COMPILED := $(patsubst %.c,%.abi3.so,$(wildcard server/mapless_server/kernels/*.c))
 $(COMPILED): setup.py $(wildcard server/mapless_server/kernels/*.c) $(VENV)/.installed
 	$(BIN)/python setup.py --quiet build_ext --inplace
 	test ! -e $@ || touch $@

@@ -69,8 +69,9 @@ def test_auto_leaves_out_what_is_missing_and_logs_it(
     with caplog.at_level(logging.INFO):
         (tier,) = make_tiers(settings(tmp_path, features="auto"))
     assert tier.extractor.name.startswith("sift")
-    record, compared = caplog.records
+    record, compared, adjusted = caplog.records
     assert compared.getMessage().startswith("descriptors of int8 are compared by ")
+    assert adjusted.getMessage().startswith("poses are adjusted by ")
     assert expected in record.getMessage()
     assert "\n" not in record.getMessage()
     assert record.getMessage().startswith(f"features auto: sift; with {names} more ")

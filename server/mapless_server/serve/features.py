@@ -12,7 +12,7 @@ from pathlib import Path
 from mapless_server.choices import AUTO, BEST_VARIANTS, OFF, STORED
 from mapless_server.engine.query import Tier
 from mapless_server.extras import install_hint
-from mapless_server.kernels import nearest
+from mapless_server.kernels import adjustment, nearest
 from mapless_server.method.coarse.make import make_reconstructor
 from mapless_server.method.features.extractors import FeatureExtractor, make_extractor
 from mapless_server.method.features.extractors.options import ALIKED_VARIANT, LearnedOptions
@@ -88,8 +88,11 @@ def make_tiers(settings: Settings) -> tuple[Tier, ...]:
         for name in extractors
     }
     _log_features(settings, extractors, missing)
-    compiled = nearest.is_available(DESCRIPTOR_LENGTH)
-    log.info("descriptors of int8 are compared by %s", "compiled code" if compiled else "numpy, in more time")
+    for what, is_compiled in (
+        ("descriptors of int8 are compared", nearest.is_available(DESCRIPTOR_LENGTH)),
+        ("poses are adjusted", adjustment.IS_COMPILED),
+    ):
+        log.info("%s by %s", what, "compiled code" if is_compiled else "numpy, in more time")
     reconstructor = make_reconstructor(
         settings.backend,
         settings.weights_dir,

@@ -60,6 +60,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
+from mapless_server.kernels import adjustment
 
 from ..features.tracks import summed
 from ..optim.optimize import LEAST_DAMPING, cauchy_weight, take, world_jacobian
@@ -157,7 +158,9 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     if to_pose is None:
         return None
 
-    matrices, gradients = _without_each(seen, data, gradient, points, *_whitened(seen, residual, weight, points))
+    matrices, gradients = _without_each(
+        seen, data, gradient, points, *_whitened(seen, there.by_point, residual, weight, points)
+    )
     matrices, gradients = prior + matrices, prior_gradient + gradients
     matrices[1:, query, query] += LEAST_LEFT * np.linalg.inv(to_pose[:, query])
     right = np.concatenate([matrices[:, posed, posed.stop :], gradients[:, posed, None]], axis=2)
@@ -229,12 +232,16 @@ def _without_each(
     seen: ViewColumns, data: Array, gradient: Array, points: EliminatedPoints, gain: Array, misfit: Array
 ) -> tuple[Array, Array]:
     """Reduced equations (1 + V, U, U), (1 + V, U) of all observations, and of those without each of V references."""
+    matrices, gradients = np.tile(data, (len(seen.parts), 1, 1)), np.tile(gradient, (len(seen.parts), 1))
+    if adjustment.IS_COMPILED:
+        its = seen.seen(points.factor.shape[1])
+        adjustment.leave_each_out(its, gain, misfit, points.rows, matrices, gradients)
+        return matrices, gradients
     count, end = len(data), seen.parts[-1].start
     # A row an observation, so that the block of its point is read from one place in memory.
     by_point = np.ascontiguousarray(points.cross.reshape(count, 3, -1).T)  # (P, 3, U)
     lost = np.ascontiguousarray(gain[:, :, :end].T) @ by_point[seen.point[:end]]  # (O, 2, U)
     misfit = np.ascontiguousarray(misfit.T)
-    matrices, gradients = np.tile(data, (len(seen.parts), 1, 1)), np.tile(gradient, (len(seen.parts), 1))
     for i, part in enumerate(seen.parts[:-1]):
         its_own = lost[part].reshape(-1, count)
         matrices[i + 1] -= its_own.T @ its_own
@@ -322,9 +329,11 @@ def _by_region(
     return (of_match @ member).T, np.moveaxis(squares, 2, 0)
 
 
-def _whitened(seen: ViewColumns, residual: Array, weight: Array, points: EliminatedPoints) -> tuple[Array, Array]:
+def _whitened(
+    seen: ViewColumns, by_point: Array, residual: Array, weight: Array, points: EliminatedPoints
+) -> tuple[Array, Array]:
     """For each observation, a R^-T (3, 2, O) and R^-1 e (2, O), with S = R R^T."""
-    across = np.swapaxes(points.by_point, 0, 1)
+    across = np.stack(forward(take(points.factor, seen.point), np.swapaxes(by_point, 0, 1)))
     misfit = residual - (across * take(points.gradient, seen.point)[:, None]).sum(axis=0)
     least = LEAST_VARIANCE / weight
     (xx, yy), xy = 1 / weight - (across**2).sum(axis=0), -(across[:, 0] * across[:, 1]).sum(axis=0)

@@ -1,6 +1,7 @@
 """Normal equations of a bundle adjustment, from observations sorted by view, and the elimination of the points.
 
-The unknowns are poses of cameras, points, and errors of the query's intrinsics.
+The unknowns are poses of cameras, points, and errors of the query's intrinsics. What is computed stands here, as numpy
+does it; where `kernels.adjustment` is compiled, that computes the same in less time.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from mapless.geometry import Array, RigidTransform
+from mapless_server.kernels import adjustment
+from mapless_server.kernels.adjustment import Cross, Seen
 
 from ..features.tracks import summed
 from ..optim.optimize import (
@@ -137,6 +140,11 @@ class ViewColumns:
         ends = np.searchsorted(self.view, np.arange(self.view_count + 1)).tolist()
         return tuple(slice(*part) for part in itertools.pairwise(ends))
 
+    def seen(self, points: int) -> Seen:
+        """The observations, of so many points."""
+        ends = np.array([part.stop for part in self.parts], np.intp)
+        return Seen(ends, self.point, self.view, points, self.by_intrinsics.shape[1])
+
     @cached_property
     def sums(self) -> csc_array:
         """(P, O) sparse: a product with it sums over the observations of each point."""
@@ -157,6 +165,16 @@ class ViewColumns:
 
     def at(self, bundle: Bundle) -> Linearized:
         """The residuals at the values of a bundle, with their derivatives."""
+        if adjustment.IS_COMPILED:
+            poses, its = bundle.poses, (bundle.points, self.focal, self.offset)
+            found = adjustment.project(self.seen(len(bundle.points)), poses.rotation, poses.translation, *its)
+        else:
+            found = self._projected(bundle)
+        if bundle.intrinsics.size:
+            found[0][:, self.parts[-1]] += np.einsum("aio,i->ao", self.by_intrinsics, bundle.intrinsics)
+        return Linearized(bundle, *found)
+
+    def _projected(self, bundle: Bundle) -> tuple[Array, Array, Array]:
         rotation = take(columns(bundle.poses.rotation), self.view)
         x_in_world = take(np.ascontiguousarray(bundle.points.T), self.point)
         x, y, z = apply_columns(rotation, x_in_world) + take(bundle.poses.translation.T, self.view)
@@ -164,10 +182,7 @@ class ViewColumns:
         ideal, slope = np.stack([x, y]) * inverse_depth, self.focal * inverse_depth
         by_point = slope[:, None] * (rotation[:2] - ideal[:, None] * rotation[2])
         by_pose = pose_columns(ideal, self.focal, inverse_depth)
-        residual = ideal * self.focal + self.offset
-        if bundle.intrinsics.size:
-            residual[:, self.parts[-1]] += np.einsum("aio,i->ao", self.by_intrinsics, bundle.intrinsics)
-        return Linearized(bundle, residual, by_point, by_pose)
+        return ideal * self.focal + self.offset, by_point, by_pose
 
     def equations(
         self, there: Linearized, loss_scale_sigma: float, least_curvature: float = 1.0, weight: Array | None = None
@@ -178,9 +193,25 @@ class ViewColumns:
         which leaves the gradient as it is. For a weight w the loss curves by w (2 w - 1) along r. But c^2 is least at
         w = 1/2 and 1 far away, where the curvature is negative.
         """
+        weight = cauchy_weight((there.residual**2).sum(axis=0), loss_scale_sigma) if weight is None else weight
+        if adjustment.IS_COMPILED:
+            its = there.residual, there.by_point, there.by_pose, self.by_intrinsics
+            found = adjustment.equations(self.seen(len(there.bundle.points)), *its, weight, least_curvature)
+        else:
+            found = self._equations(there, weight, least_curvature)
+        if self.planes is not None:
+            _, _, _, point_block, point_gradient = found
+            normal = self.planes.normal.T
+            weighted = normal * self.planes.information
+            point_block += symmetric_products(weighted[None], normal[None])
+            point_gradient += weighted * self.planes.distance(there.bundle.points)
+        return NormalEquations(self, *found)
+
+    def _equations(
+        self, there: Linearized, weight: Array, least_curvature: float
+    ) -> tuple[Cross, Array, Array, Array, Array]:
         residual, by_point, by_pose = there.residual, there.by_point, there.by_pose
         squared, last, by_intrinsics = (residual**2).sum(axis=0), self.parts[-1], self.by_intrinsics
-        weight = cauchy_weight(squared, loss_scale_sigma) if weight is None else weight
         if least_curvature < 1:
             shrink = np.sqrt(1 - 4 * (1 - least_curvature) * weight * (1 - weight))
             along = residual * ((1 - shrink) / np.maximum(squared, 1e-12))
@@ -202,14 +233,14 @@ class ViewColumns:
             gradients.append(weighted_x @ residual[0, part] + weighted_y @ residual[1, part])
         terms = symmetric_products(weighted_point, by_point), (weighted_point * residual[:, None]).sum(axis=0)
         point_block, point_gradient = np.split(summed(self.sums, np.concatenate(terms)), [6])
-        if self.planes is not None:
-            normal = self.planes.normal.T
-            weighted = normal * self.planes.information
-            point_block += symmetric_products(weighted[None], normal[None])
-            point_gradient += weighted * self.planes.distance(there.bundle.points)
-        pose_block, pose_gradient = _block_diagonal(blocks), np.concatenate(gradients)
-        by_camera = weighted_pose, weighted_intrinsics
-        return NormalEquations(self, pose_block, pose_gradient, point_block, point_gradient, by_point, *by_camera)
+        its = by_point[:, :, last] if by_intrinsics.size else by_point[:, :, :0]
+        return (
+            Cross(
+                np.einsum("kao,kbo->oba", weighted_pose, by_point),
+                np.einsum("kao,kbo->oba", weighted_intrinsics, its),
+            ),
+            *(_block_diagonal(blocks), np.concatenate(gradients), point_block, point_gradient),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,48 +265,42 @@ class NormalEquations:
 
     Attributes:
         columns: the observations.
+        cross: E, in rows of the observations.
         pose_block: B, (6 V + I, 6 V + I).
         pose_gradient: g, (6 V + I,).
         point_block: C, (6, P) as in `optimize.SYMMETRIC`.
         point_gradient: h, (3, P).
-        by_point: A, (2, 3, O), derivatives of the residuals by the points.
-        weighted_pose: w J, (2, 6, O), weighted derivatives by the poses. J^T w A is the block of E of an observation.
-        weighted_intrinsics: (2, I, O_q), the same by the query's intrinsics.
     """
 
     columns: ViewColumns
+    cross: Cross
     pose_block: Array
     pose_gradient: Array
     point_block: Array
     point_gradient: Array
-    by_point: Array
-    weighted_pose: Array
-    weighted_intrinsics: Array
 
     def reduced(self, damping: float) -> tuple[Array, Array, EliminatedPoints]:
         """Eliminates the points: B - E C^-1 E^T (U, U), g - E C^-1 h (U,), U = 6 V + I; `damping` enlarges diagonals.
 
         With Cholesky's C = L L^T the products are those of F = E L^-T with itself and with L^-1 h.
         """
+        matrix = self.pose_block + damping * np.diag(np.diag(self.pose_block))
+        if adjustment.IS_COMPILED:
+            vector, seen = self.pose_gradient.copy(), self.columns.seen(self.point_block.shape[1])
+            points = self.point_block, self.point_gradient
+            found = adjustment.eliminate(seen, damping, *points, self.cross, matrix, vector)
+            return matrix, vector, EliminatedPoints(self.columns, *found)
         damped = self.point_block.copy()
         damped[:3] *= 1 + damping
-        factor = _cholesky(damped)
-        gradient = np.stack(forward(factor, self.point_gradient))
-        seen = self.columns
-        by_point = np.stack(forward(take(factor, seen.point), np.swapaxes(self.by_point, 0, 1)), axis=1)
-        by_observation = np.einsum("kao,kbo->abo", self.weighted_pose, by_point).reshape(18, -1)
-        by_view = np.zeros((len(seen.parts), 18, self.point_gradient.shape[1]))
-        for cross, part in zip(by_view, seen.parts, strict=True):
-            cross[:, seen.point[part]] = by_observation[:, part]  # one observation per point and view
-        wide = by_view.reshape(6 * len(by_view), -1)
-        if self.weighted_intrinsics.size:
-            last = seen.parts[-1]
-            of_query = np.einsum("kao,kbo->abo", self.weighted_intrinsics, by_point[:, :, last])
-            its_rows = np.zeros((*of_query.shape[:2], self.point_gradient.shape[1]))
-            its_rows[:, :, seen.point[last]] = of_query
-            wide = np.concatenate([wide, its_rows.reshape(len(of_query), -1)])
-        matrix = self.pose_block + damping * np.diag(np.diag(self.pose_block)) - wide @ wide.T
-        return matrix, self.pose_gradient - wide @ gradient.ravel(), EliminatedPoints(factor, gradient, wide, by_point)
+        factor, seen_points = _cholesky(damped), self.columns.point
+        gradient, its_query = np.stack(forward(factor, self.point_gradient)), self.columns.parts[-1]
+        by_intrinsics = self.cross.by_intrinsics
+        rows = (self.cross.by_pose, seen_points), (by_intrinsics, seen_points[its_query][: len(by_intrinsics)])
+        left = (forward(take(factor, point), columns(it)) for it, point in rows)
+        cross = Cross(*(np.moveaxis(np.stack(it), -1, 0) for it in left))
+        eliminated = EliminatedPoints(self.columns, factor, gradient, cross)
+        wide = eliminated.cross
+        return matrix - wide @ wide.T, self.pose_gradient - wide @ gradient.ravel(), eliminated
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,19 +308,35 @@ class EliminatedPoints:
     """The data needed to compute the points once the cameras are known.
 
     Attributes:
+        columns: the observations.
         factor: L (6, P), as in `optimize.SYMMETRIC`.
         gradient: L^-1 h, (3, P).
-        cross: E L^-T, (U, 3 P).
-        by_point: A L^-T, (2, 3, O), each with the factor of its point.
+        rows: E L^-T, in rows of the observations.
     """
 
+    columns: ViewColumns
     factor: Array
     gradient: Array
-    cross: Array
-    by_point: Array
+    rows: Cross
+
+    @cached_property
+    def cross(self) -> Array:
+        """E L^-T, (U, 3 P)."""
+        seen, count = self.columns, self.factor.shape[1]
+        by_view = np.zeros((len(seen.parts), 6, 3, count))
+        by_pose, by_intrinsics = (it.transpose(2, 1, 0) for it in (self.rows.by_pose, self.rows.by_intrinsics))
+        for its, part in zip(by_view, seen.parts, strict=True):
+            its[:, :, seen.point[part]] = by_pose[:, :, part]  # one observation per point and view
+        of_query = np.zeros((*by_intrinsics.shape[:2], count))
+        if by_intrinsics.size:
+            of_query[:, :, seen.point[seen.parts[-1]]] = by_intrinsics
+        return np.concatenate([by_view.reshape(-1, 3 * count), of_query.reshape(-1, 3 * count)])
 
     def steps(self, motion: Array) -> Array:
         """Steps (P, 3) of the points that follow from a motion (U,) of the cameras."""
+        if adjustment.IS_COMPILED:
+            seen = self.columns.seen(self.factor.shape[1])
+            return adjustment.step(seen, self.factor, self.gradient, self.rows, motion)
         xx, yy, zz, xy, xz, yz = self.factor
         x, y, z = -(self.gradient + (motion @ self.cross).reshape(3, -1))
         z = z / zz

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array
+from mapless_server.kernels import adjustment
 
 from ..features.tracks import Tracks
 from ..features.views import PosedView, Reconstruction
@@ -182,6 +183,10 @@ def adjust_points(observations: Observations, x_in_world: Array, loss_scale_sigm
     Rows with NaN stay as they are, and no point has a higher cost than at the start. The loss turns from square to
     linear at `loss_scale_sigma` standard deviations.
     """
+    if adjustment.IS_COMPILED:
+        it, start = observations, np.append(observations.tracks.starts, len(observations.tracks.point))
+        given = it.rotation, it.translation, it.focal, it.offset, x_in_world
+        return adjustment.adjust_each(start, *given, loss_scale_sigma, iterations)
 
     def cost(points: Array) -> Array:
         return _costs(observations, points.T, loss_scale_sigma)
