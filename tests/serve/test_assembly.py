@@ -93,7 +93,7 @@ def test_auto_uses_the_best_features_whose_weights_are_there(tmp_path: Path, cap
     assert (tier.any_roll, any_roll.any_roll) == (False, True)
     assert (tier.max_pixels, any_roll.max_pixels) == (None, ANY_ROLL_PIXELS)
     assert tier.extractor.name.startswith("edgepoint2-l64-")
-    record, _ = caplog.records
+    record, *_ = caplog.records
     assert record.getMessage().startswith("features auto: edgepoint2-l64 and sift; with aliked and aliked-")
     assert record.getMessage().endswith("run `mapless-server weights fetch aliked aliked-lightglue`")
 
