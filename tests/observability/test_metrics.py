@@ -267,7 +267,8 @@ def test_ready_is_200_exactly_while_health_is_serving(metrics: Metrics, server: 
     assert ask(server.port, "/ready") == (200, "serving\n")
     assert ask(server.port, "/ready?from=probe") == (200, "serving\n")
     metrics.set_serving(False)
-    assert ask(server.port, "/ready") == (503, "not serving\n")  # draining
+    metrics.not_serving_because = "stopping"
+    assert ask(server.port, "/ready") == (503, "not serving: stopping\n")
     assert ask(server.port, "/metrics")[0] == 200
 
 

@@ -20,7 +20,7 @@ from support.programs import printed
 from mapless_server.observability.otlp import MAX_STAGES, OtlpTracer, make_otlp_tracer
 from mapless_server.scheduling import StageRecord
 from mapless_server.serve import running
-from mapless_server.serve.assembly import StartupError
+from mapless_server.serve.startup import StartupError
 from mapless_server.settings import Settings
 
 METHOD = "/mapless.v1.LocalizationService/Localize"

@@ -23,7 +23,7 @@ from mapless_ray import ingress, replica
 from mapless_ray.environment import check_environment, variables
 from mapless_ray.ingress import Ingress, add_services
 from mapless_server.observability.metrics import Metrics
-from mapless_server.serve.assembly import StartupError
+from mapless_server.serve.startup import StartupError
 from mapless_server.services.handlers import SERVICE_NAMES, Services
 from mapless_server.settings import Settings
 from mapless_server.store import Store

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from mapless_server.security.binding import assess_binding, is_loopback, resolve_host
-from mapless_server.serve.assembly import StartupError
 from mapless_server.serve.running import running_server
+from mapless_server.serve.startup import StartupError
 from mapless_server.settings import Settings
 
 HOSTS = {

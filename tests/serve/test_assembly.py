@@ -15,9 +15,10 @@ from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsMissing
 from mapless_server.observability.metrics import Metrics
 from mapless_server.serve import features
-from mapless_server.serve.assembly import StartupError, make_engine
 from mapless_server.serve.devices import choose_device
 from mapless_server.serve.features import ANY_ROLL_PIXELS, feature_names, make_first_features, make_tiers
+from mapless_server.serve.opening import make_engine
+from mapless_server.serve.startup import StartupError
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 

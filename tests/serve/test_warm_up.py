@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from numpy.typing import NDArray
+from support.commands import run_client
 from support.programs import gated
 from support.servers import (
     COVARIANCE,
@@ -46,8 +47,10 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import CostModel, Flow
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import MakeEngine, Parts, StartupError, engine_options, engine_over
+from mapless_server.serve.assembly import Parts, engine_options, engine_over
 from mapless_server.serve.features import make_tiers
+from mapless_server.serve.opening import MakeEngine
+from mapless_server.serve.startup import StartupError
 from mapless_server.serve.warm_up import ROUNDS, warm_up, warm_up_stronger
 from mapless_server.settings import Settings
 from mapless_server.store import Store
@@ -235,8 +238,16 @@ def starting(folder: Path, make: MakeEngine) -> Iterator[tuple[str, Callable[[],
         yield f"127.0.0.1:{port}", lambda: (entering.result(LIMIT_S), None)[1]
 
 
-@pytest.mark.parametrize("phase", ["the engine is made", "the first photograph is localized"])
-def test_a_starting_server_rejects_calls_and_then_serves(tmp_path: Path, phase: str) -> None:
+STEPS = {
+    "the engine is made": "it loads its features and their weights",
+    "the first photograph is localized": "it localizes its first photograph",
+}
+
+
+@pytest.mark.parametrize("phase", STEPS)
+def test_a_starting_server_answers_what_needs_the_store_alone(
+    tmp_path: Path, phase: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     began, gate = threading.Event(), threading.Event()
 
     def hold() -> None:
@@ -259,7 +270,15 @@ def test_a_starting_server_rejects_calls_and_then_serves(tmp_path: Path, phase: 
                 assert asked.status == health_pb2.HealthCheckResponse.NOT_SERVING
             error = failure_of(stubs.localization.Localize, localize_request("s"))
             assert (error.code, error.reason) == ("UNAVAILABLE", "STARTING")
-            assert error.retry_after_s == 1.0
+            assert (error.message, error.retry_after_s) == (f"the server is starting: {STEPS[phase]}", 1.0)
+            stubs.references.CreateScene(reference_pb.CreateSceneRequest(scene_id="early"), timeout=10)
+            (scene,) = stubs.references.ListScenes(reference_pb.ListScenesRequest(), timeout=10).scenes
+            request = reference_pb.ListReferencesRequest(scene=scene.name)
+            assert not stubs.references.ListReferences(request, timeout=10).references
+            needs_more = failure_of(stubs.references.GetScene, reference_pb.GetSceneRequest(name=scene.name))
+            assert needs_more.reason == error.reason
+            _, printed, _ = run_client(capsys, "doctor", "--address", address)
+            assert error.message in printed
         finally:
             gate.set()
         until_started()

@@ -35,7 +35,8 @@ from mapless_server.method.structure.model import MetricScale, ScaleStage
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scheduling import Abandoned
 from mapless_server.security import RateLimiter
-from mapless_server.serve.assembly import MakeEngine, Parts, engine_options, engine_over, make_engine
+from mapless_server.serve.assembly import Parts, engine_options, engine_over
+from mapless_server.serve.opening import MakeEngine, make_engine
 from mapless_server.serve.running import Running, running_server
 from mapless_server.settings import Settings
 from mapless_server.store import Store

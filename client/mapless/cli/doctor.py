@@ -19,7 +19,9 @@ from ..options import ConnectOptions
 from ..proxies import Proxy, proxy_of
 from ..reaching import connection_fault, speaks_tls
 from ..results import Reference
+from ..v1 import localization_service_pb2 as localization_pb
 from ..v1 import reference_service_pb2 as pb
+from ..v1.localization_service_pb2_grpc import LocalizationServiceStub
 from ..v1.reference_service_pb2_grpc import ReferenceServiceStub
 from .folder import EXIT_FAILED
 from .output import serving_states, show, suggesting
@@ -178,11 +180,18 @@ def _check_services(session: _Session) -> _Result:
 
 
 def _advice_of_silent(session: _Session) -> str:
-    """Makes a call, whose error says whether the server starts or stops."""
-    try:
-        _check_token(session)
-    except MaplessError as error:
-        return _ADVICE.get(error.reason, "wait while it starts or stops")
+    """Asks for nothing to be localized: the error says whether the server starts, and what it does, or stops."""
+    options = session.client.options
+    with options.channel(session.client.address) as channel:
+        method, request = LocalizationServiceStub(channel).Localize, localization_pb.LocalizeRequest()
+        try:
+            method(request, timeout=options.timeout_s, metadata=options.metadata())
+        except grpc.RpcError as call:
+            error = from_rpc_error(call)
+            if error.reason == "STARTING":
+                return f"{error.message}: wait until it is ready, some seconds"
+            if error.code in ("UNAVAILABLE", "UNAUTHENTICATED", "PERMISSION_DENIED"):
+                return _ADVICE.get(error.reason, "wait while it starts or stops")
     return "it stops soon, and answers until then: use another server"
 
 
@@ -281,7 +290,6 @@ _ADVICE = {
     "TOKEN_EXPIRED": _TOKENS,
     "NOT_FOUND": "`mapless scene list` lists the scenes that there are",
     "ROLE_TOO_LOW": "use a token of the role localize or write",
-    "STARTING": "it starts: wait until it is ready, some seconds",
     "DRAINING": "it stops, and answers only the calls that it has: use another server, or start it again",
 }
 """By the reason of an error."""

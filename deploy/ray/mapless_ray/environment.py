@@ -7,7 +7,7 @@ import os
 import shlex
 from collections.abc import Mapping
 
-from mapless_server.serve.assembly import StartupError
+from mapless_server.serve.startup import StartupError
 from mapless_server.settings import Settings
 
 LEAVING_S = 10.0

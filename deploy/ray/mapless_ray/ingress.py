@@ -17,7 +17,7 @@ from grpc_status import rpc_status
 from mapless.v1 import localization_service_pb2, reference_service_pb2
 from mapless_server.errors import Unavailable
 from mapless_server.rpc import to_status
-from mapless_server.serve.assembly import StartupError
+from mapless_server.serve.startup import StartupError
 from mapless_server.services.handlers import Services
 from mapless_server.settings import Settings
 

@@ -10,7 +10,7 @@ from typing import Any
 import ray
 
 from mapless_server.observability.logs import configure_logging
-from mapless_server.serve.assembly import MakeEngine, make_engine
+from mapless_server.serve.opening import MakeEngine, make_engine
 from mapless_server.serve.run import SWITCH_INTERVAL_S, exit_failed
 from mapless_server.serve.running import running_server
 from mapless_server.settings import Settings, load_settings

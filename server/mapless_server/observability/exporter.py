@@ -82,7 +82,7 @@ def _application(registry: CollectorRegistry, state: Metrics, store_probe: Store
         if not beats_within(READY_LIMIT_S):
             return "hanging"
         if not state.is_serving:
-            return "not serving"
+            return "not serving" + (state.not_serving_because and f": {state.not_serving_because}")
         return store_probe.fault() if asks_for_store and store_probe is not None else ""
 
     def answer(environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:

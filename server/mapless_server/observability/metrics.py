@@ -100,6 +100,7 @@ class Metrics(Observer, BackgroundObserver):
         registry: registry of all metrics.
         scraped: the metrics that are read from other objects at every scrape.
         is_serving: the last value of `set_serving`; False before.
+        not_serving_because: what the server does while it does not serve; empty where that is not known.
         beaten_s: time of the last `beat`, by `time.monotonic`; None before.
     """
 
@@ -110,6 +111,7 @@ class Metrics(Observer, BackgroundObserver):
         PlatformCollector(registry=self.registry)
         GCCollector(registry=self.registry)
         self.is_serving = False
+        self.not_serving_because = ""
         self.beaten_s: float | None = None
         self.scraped = Scraped()
         self.registry.register(self.scraped)

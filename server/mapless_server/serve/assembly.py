@@ -1,10 +1,10 @@
-"""Makes the engine and its store from the settings; replaces parts that `auto` would use but are not installed.
+"""Makes the engine from the settings; replaces parts that `auto` would use but are not installed.
 
 Nothing here imports torch unless the settings name a network.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from mapless_server.choices import OFF, STORED
@@ -13,7 +13,6 @@ from mapless_server.engine.query import Tier
 from mapless_server.engine.queue_engine import QueueEngine, check_tiers
 from mapless_server.engine.references import References, Retrieval
 from mapless_server.engine.stages import Method
-from mapless_server.extras import install_hint
 from mapless_server.images import ImageLimits
 from mapless_server.method.coarse import Reconstructor
 from mapless_server.method.coarse.make import make_reconstructor
@@ -37,21 +36,18 @@ from mapless_server.scenes.stored import DepthFinder, PairFinder, TierMatching
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings
-from mapless_server.store import Store, StoreError
+from mapless_server.store import Store
 from mapless_server.store.depths import depth_kind
 from mapless_server.store.pairs import PairStore
 
 from .devices import choose_device
 from .features import device_for, make_tiers
+from .startup import StartupError, what_is_missing
 
 log = logging.getLogger(__name__)
 
 CACHED_AUDIT_PAIRS = 2000
 """Pairs of references whose matches audits keep in memory, about 10 KB a pair."""
-
-
-class StartupError(Exception):
-    """The server cannot start; the message is one sentence for the operator."""
 
 
 def image_limits(settings: Settings) -> ImageLimits:
@@ -75,20 +71,6 @@ def engine_options(settings: Settings) -> EngineOptions:
             stall_limit_s=settings.stall_limit_s,
         ),
     )
-
-
-def open_store(settings: Settings) -> Store:
-    """Opens the store of the settings' database or data folder; StartupError if it cannot be opened."""
-    cache_bytes = settings.reference_cache_mib * 2**20
-    try:
-        if settings.database_url is not None:
-            return Store.connect(settings.database_url.get_secret_value(), cache_bytes)
-        return Store.open(settings.data_dir, cache_bytes)
-    except StoreError as error:
-        raise StartupError(str(error)) from error
-
-
-MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], QueueEngine]
 
 
 def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
@@ -231,8 +213,3 @@ def make_descriptor(settings: Settings, extractor: FeatureExtractor) -> GlobalDe
 
 UNUSABLE = (ImportError, ValueError, WeightsError)
 """The errors of settings that name what is not there, or cannot be used."""
-
-
-def what_is_missing(error: Exception) -> str:
-    """The error for the operator; of a package that is missing, how to get it."""
-    return install_hint(error) if isinstance(error, ImportError) else str(error)

@@ -61,8 +61,8 @@ def serve_command(config: Config = None, **flags: Any) -> None:
     configure_libraries(loaded.settings)
 
     gc.disable()  # a fifth of the time of the imports, also of torch's; `serve` enables it when it is ready
-    from .assembly import StartupError
     from .run import serve
+    from .startup import StartupError
 
     try:
         asyncio.run(serve(loaded.settings))

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 from mapless_server.settings import Settings
 
-from .assembly import MakeEngine, make_engine
+from .opening import MakeEngine, make_engine
 from .running import running_server
 
 log = logging.getLogger(__name__)

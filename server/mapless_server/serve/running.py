@@ -1,5 +1,7 @@
 """A running server: opens its parts in order, and closes them in reverse order at the end of its block."""
 
+from __future__ import annotations
+
 import asyncio
 import errno
 import logging
@@ -14,7 +16,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 import grpc
 
 from mapless_server import __version__
-from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.errors import RequestError
 from mapless_server.observability.event_loop import watch_event_loop
 from mapless_server.observability.exporter import MetricsServer
@@ -38,10 +39,11 @@ from mapless_server.services.handlers import Services
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
-from .assembly import MakeEngine, StartupError, make_engine, open_store, what_is_missing
-from .warm_up import QUIET_S, warm_up, warm_up_stronger
+from .opening import MakeEngine, make_engine, open_store
+from .startup import StartupError, what_is_missing
 
 if TYPE_CHECKING:
+    from mapless_server.engine.queue_engine import QueueEngine
     from mapless_server.observability.otlp import OtlpTracer
 
 MAX_CONCURRENT_RPCS = 2048
@@ -54,6 +56,9 @@ _MOST_OF_GRPC = 2**31 - 1
 
 _LAST_BYTES_S = 0.5
 """Time for answers in transit when the last call has ended."""
+
+QUIET_S = 10.0
+"""A server that has computed nothing for so long is idle: fleets and imports have shorter gaps."""
 
 
 class AddressTaken(Exception):
@@ -187,7 +192,7 @@ async def running_server(
 ) -> AsyncIterator[Running]:
     """Runs a server within a program; it is drained at the end of the block.
 
-    It listens at once, and answers calls after the warm-up.
+    It listens at once, answers calls that need the store alone, and all calls after the warm-up.
 
     Args:
         settings: its settings; port 0 for any free one.
@@ -232,6 +237,7 @@ async def _start(
     listener = listen(settings, services, None if protection.tls is None else protection.tls.server_credentials())
     stack.push_async_callback(listener.close)
     await listener.start()
+    services.starts("it loads its features and their weights")
     engine = await asyncio.to_thread(make, settings, store, metrics, protection.quota)
     stack.push_async_callback(engine.close)
     failed: asyncio.Future[Fatal] = asyncio.get_running_loop().create_future()
@@ -254,9 +260,12 @@ async def _start(
         await services.set_serving(False)
 
     _run_task(stack, stop_serving())
+    services.starts("it localizes its first photograph")
     await _warm_up(settings, engine, metrics)
     await services.open(engine)
     if settings.warm_up:
+        from .warm_up import warm_up_stronger
+
         _run_task(stack, warm_up_stronger(engine, QUIET_S))
     if engine.background is not None:
         engine.background.start(settings.background_matching)
@@ -272,7 +281,7 @@ def _port_of(address: str) -> int:
     return int(port) if port.isdecimal() else 0
 
 
-def _make_tracer(settings: Settings) -> "OtlpTracer | None":
+def _make_tracer(settings: Settings) -> OtlpTracer | None:
     if not settings.otlp_endpoint:
         return None
     try:
@@ -317,6 +326,8 @@ def _observe_engine(engine: QueueEngine, metrics: Metrics) -> None:
 
 
 async def _warm_up(settings: Settings, engine: QueueEngine, metrics: Metrics) -> None:
+    from .warm_up import warm_up  # it computes, see `opening`
+
     engine.queue.start()
     if not settings.warm_up:
         return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from mapless_server.engine.queue_engine import QueueEngine
     from mapless_server.observability.otlp import OtlpTracer
 
+log = logging.getLogger(__name__)
+
 SERVICE_NAMES = (
     localization_service_pb2.DESCRIPTOR.services_by_name["LocalizationService"].full_name,
     reference_service_pb2.DESCRIPTOR.services_by_name["ReferenceService"].full_name,
@@ -46,6 +49,13 @@ _NEEDS_ROOM = {
     **{f"/{SERVICE_NAMES[1]}/{name}": False for name in ("CreateReference", "BatchCreateReferences")},
 }
 """The methods whose messages are large and whose work waits in the queue, and whether they are queries."""
+
+
+_OF_STORE = frozenset(
+    f"/{SERVICE_NAMES[1]}/{name}"
+    for name in ("CreateScene", "ListScenes", "UpdateScene", "GetReference", "ListReferences", "UpdateReference")
+)
+"""The methods that need the store alone: they are answered while the server starts."""
 
 
 class _Health(health.aio.HealthServicer):  # type: ignore[name-defined,misc]
@@ -67,7 +77,9 @@ class _Health(health.aio.HealthServicer):  # type: ignore[name-defined,misc]
 
 
 class Services:
-    """All services of a server. They answer UNAVAILABLE until `open` sets the engine; `drain` ends them in order.
+    """All services of a server; `drain` ends them in order.
+
+    Until `open` sets the engine they answer calls that need the store alone, and UNAVAILABLE to others.
 
     `handlers`, by service and method, are for the server that listens.
     """
@@ -87,6 +99,7 @@ class Services:
         self._health = _Health()
         self._is_serving = self._is_draining = False
         self._is_changeable = True
+        self._start = "it opens its store"
         self._guard = CallGuard(
             settings.default_deadline_s,
             settings.max_deadline_s,
@@ -130,6 +143,12 @@ class Services:
         for service in (reflection.SERVICE_NAME, "grpc.reflection.v1.ServerReflection"):
             self.add_registered_method_handlers(service, {"ServerReflectionInfo": method})
 
+    def starts(self, step: str) -> None:
+        """Says in the log, at "/ready" and to refused callers what the server does before it serves: "it loads ..."."""
+        self._start = step
+        self._metrics.not_serving_because = f"starting: {step}"
+        log.info("the server starts: %s", step)
+
     async def open(self, engine: QueueEngine) -> None:
         """Starts to serve, with an engine that has been warmed up."""
         self._engine = engine
@@ -140,6 +159,7 @@ class Services:
 
         The delay is for load balancers, which send calls until their next health check; the wait is at most `grace_s`.
         """
+        self._metrics.not_serving_because = "stopping"
         await self.set_serving(False)
         if delay_s:
             await asyncio.sleep(delay_s)
@@ -172,11 +192,13 @@ class Services:
         """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for the caller."""
         if self._is_draining:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
+        if self._engine is None and method in _OF_STORE:
+            return
         engine = self._ready_engine()
         if (is_query := _NEEDS_ROOM.get(method)) is not None:
             engine.check_room(flow, is_query)
 
     def _ready_engine(self) -> QueueEngine:
         if self._engine is None:
-            raise Unavailable("the server is starting", reason="STARTING", retry_after_s=1.0)
+            raise Unavailable(f"the server is starting: {self._start}", reason="STARTING", retry_after_s=1.0)
         return self._engine

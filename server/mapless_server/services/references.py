@@ -390,8 +390,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         return found
 
     async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
-        """Runs an operation of the store in a thread; raises Unavailable while the server starts."""
-        self._engine()
+        """Runs an operation of the store in a thread."""
         return await asyncio.get_running_loop().run_in_executor(self._threads, operation, *arguments)
 
 

@@ -13,8 +13,9 @@ from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.matching import OPTIONS, CorrespondOptions, mutual_matches
 from mapless_server.method.features.views import PosedView, View
 from mapless_server.scenes.retrieval.ranking import spread_choice
-from mapless_server.serve.assembly import UNUSABLE, image_limits, what_is_missing
+from mapless_server.serve.assembly import UNUSABLE, image_limits
 from mapless_server.serve.features import make_first_features
+from mapless_server.serve.startup import what_is_missing
 from mapless_server.settings import Settings, available_cores
 from mapless_tools.dataset import Dataset, Frame
 from mapless_tools.progress import Progress, tracked

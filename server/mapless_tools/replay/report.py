@@ -8,8 +8,9 @@ from pathlib import Path
 
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import Tier
-from mapless_server.serve.assembly import UNUSABLE, engine_options, what_is_missing
+from mapless_server.serve.assembly import UNUSABLE, engine_options
 from mapless_server.serve.features import make_tiers
+from mapless_server.serve.startup import what_is_missing
 from mapless_server.services.capture.calls import CapturedCall, CaptureError, decode_call
 from mapless_server.services.capture.folder import calls_of
 from mapless_server.services.capture.recorder import circumstances_of

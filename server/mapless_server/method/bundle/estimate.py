@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaincinv
 
 from mapless.geometry import Array, Camera, RigidTransform
 
@@ -298,6 +297,8 @@ def error_radii(covariance: Array, probabilities: ArrayLike) -> Array:
         return np.zeros(len(probabilities))
     scale = float((eigenvalues**2).sum()) / total
     degrees_of_freedom = total / scale
+    from scipy.special import gammaincinv  # here: services import this module, and answer before it is loaded
+
     return np.asarray(np.sqrt(2 * scale * gammaincinv(degrees_of_freedom / 2, probabilities)), float)
 
 

@@ -20,7 +20,6 @@ from enum import Enum
 from typing import TypeAlias
 
 import numpy as np
-from scipy.special import chdtri
 
 from mapless.geometry import Array, Camera, RigidTransform, cross_matrix
 from mapless_server.bounds import check_bounds
@@ -267,7 +266,7 @@ class PriorCheck:
     @property
     def is_likely(self) -> bool:
         """Whether it agrees well: m^2 is below the quantile of `LIKELY_PROBABILITY`."""
-        return self.mahalanobis**2 <= float(chdtri(self.degrees_of_freedom, LIKELY_PROBABILITY))
+        return self.mahalanobis**2 <= chi_square_quantile(self.degrees_of_freedom, LIKELY_PROBABILITY)
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +369,14 @@ def sharpened(covariance: Array, information: Array) -> Array:
 
 def conflict_threshold(degrees_of_freedom: int) -> float:
     """The m^2 above which a prior is in conflict."""
-    return float(chdtri(degrees_of_freedom, CONFLICT_PROBABILITY))
+    return chi_square_quantile(degrees_of_freedom, CONFLICT_PROBABILITY)
+
+
+def chi_square_quantile(degrees_of_freedom: int, above: float) -> float:
+    """The value above which a chi-square variable lies with this probability."""
+    from scipy.special import chdtri  # here: services import this module, and answer before it is loaded
+
+    return float(chdtri(degrees_of_freedom, above))
 
 
 def check_covariance(covariance: Array, size: int) -> None:

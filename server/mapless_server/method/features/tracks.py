@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, csr_array
-from scipy.sparse.csgraph import connected_components
 
 from mapless.geometry import Array
 
 from .views import Matches, PosedView
+
+if TYPE_CHECKING:  # imported by what computes: services, which know the results, answer before
+    from scipy.sparse import csc_array, csr_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,8 @@ class Tracks:
     @cached_property
     def _sums(self) -> csr_array:
         """Matrix (P, O) whose product sums over each point's observations, five times as fast as `reduceat`."""
+        from scipy.sparse import csr_array
+
         count, ends = len(self.point), np.append(self.starts, len(self.point))
         return csr_array((np.ones(count), np.arange(count), ends), shape=(self.point_count, count))
 
@@ -91,6 +95,9 @@ def build_tracks(
     An anchor merges only the pairs of that view (the paper), so that every track begins at one of its keypoints. Where
     a chain of matches reaches two keypoints of one view, the one with more matches is kept.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     offsets = np.concatenate([[0], np.cumsum(keypoint_counts)])
     used = [
         matches + offsets[[i, j]]
