@@ -258,6 +258,10 @@ def interface(stem: str) -> str:
 
 
 def _type(message: Any, field: Any, page: str) -> str:
+    entry = next((it for it in message.nested_type if it.options.map_entry and field.type_name.endswith(it.name)), None)
+    if entry is not None:
+        key, value = (_type(entry, it, page) for it in entry.field)
+        return f"map of {key} to {value}"
     name = _link(field.type_name, page) if field.type in (_MESSAGE, _ENUM) else _TYPES[field.type]
     if field.proto3_optional:
         return f"optional {name}"

@@ -204,7 +204,8 @@ def scene_from_message(message: reference_pb.Scene, response: Any = None) -> Sce
     found = {name: getattr(response, name) for name in _SAID_OF_SCENES if hasattr(response, name)}
     if "warnings" in found:
         found["warnings"] = tuple(found["warnings"])
-    return read(Scene, message, scene_id=names.parse_scene_name(message.name), **found)
+    scene_id, labels = names.parse_scene_name(message.name), dict(message.labels)
+    return read(Scene, message, scene_id=scene_id, labels=labels, **found)
 
 
 _SAID_OF_SCENES = "warnings", "contradiction", "compared_pair_count", "agreeing_pair_count"

@@ -1,5 +1,6 @@
 """Scenes, references, and results of retrieval, audit and coverage."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 
@@ -20,6 +21,7 @@ class Scene:
         down_in_world: unit vector of gravity; None if unknown or given by the datum alone.
         calibration: measured factors of radii; None if never measured.
         arbitrary_unit: whether lengths are in an arbitrary unit, as of a COLMAP model, instead of metres.
+        labels: what groups it with other scenes, value by name.
         warnings: contradictions of these properties and the references' poses, which `update_scene` found, or of the
             references' intrinsics or poses with one another, of which `get_scene` knows; else empty.
         contradiction: the sentence of the warnings that says that the scene contradicts itself, because its references
@@ -36,6 +38,7 @@ class Scene:
     down_in_world: Vector | None = None
     calibration: Calibration | None = None
     arbitrary_unit: bool = False
+    labels: Mapping[str, str] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     contradiction: str = ""
     compared_pair_count: int = 0

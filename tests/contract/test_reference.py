@@ -79,7 +79,7 @@ def test_the_interface_is_complete_with_its_comments(generators: Any, stem: str)
     proto = (ROOT / f"proto/mapless/v1/{stem}.proto").read_text()
     for name in re.findall(r"^(?:service|message|enum|  rpc) +(\w+)", proto, re.MULTILINE):
         assert re.search(rf"^#+ {name}$", page, re.MULTILINE), name
-    fields = re.findall(r"^ +(?!//|rpc)(?:[\w.]+ )*(\w+) = \d+;", proto, re.MULTILINE)
+    fields = re.findall(r"^ +(?!//|rpc)(?:map<.*> |[\w.]+ )*(\w+) = \d+;", proto, re.MULTILINE)
     assert sorted(fields) == sorted(first_cells(page))
     words = set(re.findall(r"\w{8,}", "".join(re.findall(r"//(?! buf:).*", proto))))
     assert {word for word in words if word not in page} == set()

@@ -65,6 +65,39 @@ def test_what_is_not_given_stays_and_none_forgets(client: Client, scene: str) ->
     assert updated.reference_count == 3
 
 
+def test_scenes_are_grouped_by_labels(client: Client) -> None:
+    assert client.create_scene("lobby", labels={"site": "north", "floor": "1"}).labels["floor"] == "1"
+    client.create_scene("attic", labels={"site": "north"})
+    found = [it.scene_id for it in client.list_scenes(labels={"site": "north"}, page_size=1)]
+    assert found == ["attic", "lobby"]
+    assert client.update_scene("lobby", labels={"site": "south"}).labels == {"site": "south"}
+    assert client.update_scene("attic", labels=None).labels == {}
+    assert list(client.list_scenes(labels={"site": "north"})) == []
+
+
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        ({"a b": "1"}, "A-Z a-z 0-9"),
+        ({"": "1"}, "A-Z a-z 0-9"),
+        ({"n" * 65: "1"}, "1 to 64"),
+        ({"site": ""}, "1 to 128"),
+        ({"site": "v" * 129}, "1 to 128"),
+        ({"site": "a\nb"}, "printable"),
+        ({f"n{i}": "1" for i in range(33)}, "at most 32 labels, has 33"),
+    ],
+)
+def test_wrong_labels_are_refused_by_field(client: Client, scene: str, labels: dict[str, str], message: str) -> None:
+    for call, field in (
+        (lambda: client.create_scene("never", labels=labels), "labels"),
+        (lambda: client.update_scene(scene, labels=labels), "scene.labels"),
+        (lambda: list(client.list_scenes(labels=labels)), "labels"),
+    ):
+        with pytest.raises(InvalidArgument, match=message) as caught:
+            call()
+        assert caught.value.field == field
+
+
 def test_an_update_needs_a_mask_and_an_existing_scene(client: Client, scene: str) -> None:
     with pytest.raises(InvalidArgument) as caught:
         client.update_scene(scene)

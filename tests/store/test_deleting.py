@@ -90,6 +90,7 @@ def test_all_that_refers_to_a_scene_goes_with_it(place: Place) -> None:
     with place.open() as store:
         keys = fill(store, OFFICE)
         store.add_references(OFFICE, [replace(make_reference("masked"), mask=b"mask", depth=DepthImage(b"", 1.0))])
+        store.update_scene(OFFICE, labels={"site": "a"})
         pairs, progress = PairStore(store.database), Progress()
         while claim := pairs.claim("nearest", progress):
             made = {(keys[0], claim.key): StoredPair(np.zeros((1, 2), np.int32))} if claim.key != keys[0] else {}

@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -34,6 +34,7 @@ async def create_scene(
     datum: Datum | None = None,
     down_in_world: ArrayLike | None = None,
     arbitrary_unit: bool = False,
+    labels: Mapping[str, str] | None = None,
     timeout_s: float | None = None,
 ) -> Scene:
     """Creates a scene without references.
@@ -43,6 +44,7 @@ async def create_scene(
         datum: position of its world on the Earth, if known.
         down_in_world: (3,) direction of gravity, of any length; None for the direction that the datum gives, if any.
         arbitrary_unit: whether its references' poses are in an arbitrary unit instead of metres.
+        labels: what groups it with other scenes, such as {"site": "a", "floor": "2"}.
         timeout_s: deadline of the call.
     """
     request = pb.CreateSceneRequest(
@@ -50,6 +52,7 @@ async def create_scene(
         datum=None if datum is None else datum_to_message(datum),
         down_in_world=None if down_in_world is None else wire.vector_to_message(down_in_world, "down_in_world"),
         arbitrary_unit=arbitrary_unit,
+        labels=labels or {},
     )
     on_repeat = partial(repeats.created_scene, request)
     return await connection.call("CreateScene", request, _scene, timeout_s, on_repeat=on_repeat)
@@ -73,6 +76,7 @@ async def update_scene(
     down_in_world: ArrayLike | UnchangedType | None = UNCHANGED,
     calibration: Calibration | UnchangedType | None = UNCHANGED,
     arbitrary_unit: bool | UnchangedType | None = UNCHANGED,
+    labels: Mapping[str, str] | UnchangedType | None = UNCHANGED,
     timeout_s: float | None = None,
 ) -> Scene:
     """Changes properties of a scene. A property that is not given keeps its value; None deletes it.
@@ -83,6 +87,7 @@ async def update_scene(
         down_in_world: (3,) direction of gravity, of any length; if deleted, the datum gives it, if there is one.
         calibration: measured factors of the radii of answers.
         arbitrary_unit: whether the unit of length is arbitrary instead of the metre; None is False. No pose changes.
+        labels: what groups it with other scenes, in place of all labels before.
         timeout_s: deadline of the call.
     """
     request = pb.UpdateSceneRequest(scene=pb.Scene(name=scene_name(scene)))
@@ -91,6 +96,7 @@ async def update_scene(
         "down_in_world": down_in_world,
         "calibration": calibration,
         "arbitrary_unit": arbitrary_unit,
+        "labels": labels,
     }
     request.update_mask.paths.extend(name for name, value in values.items() if value is not UNCHANGED)
     if datum is not None and datum is not UNCHANGED:
@@ -100,14 +106,20 @@ async def update_scene(
     if calibration is not None and calibration is not UNCHANGED:
         request.scene.calibration.CopyFrom(calibration_to_message(calibration))
     request.scene.arbitrary_unit = arbitrary_unit is True
+    if labels is not None and labels is not UNCHANGED:
+        request.scene.labels.update(labels)
     return await connection.call("UpdateScene", request, _scene, timeout_s)
 
 
 async def list_scenes(
-    connection: Connection, *, page_size: int = 0, timeout_s: float | None = None
+    connection: Connection,
+    *,
+    labels: Mapping[str, str] | None = None,
+    page_size: int = 0,
+    timeout_s: float | None = None,
 ) -> AsyncIterator[Scene]:
-    """Lists all scenes by id, fetched page by page; the deadline holds for each page."""
-    request = pb.ListScenesRequest(page_size=page_size)
+    """Lists the scenes with all of these labels by id, fetched page by page; the deadline holds for each page."""
+    request = pb.ListScenesRequest(page_size=page_size, labels=labels or {})
     scenes = connection.listed("ListScenes", request, lambda page: map(scene_from_message, page.scenes), timeout_s)
     async for scene in scenes:
         yield scene

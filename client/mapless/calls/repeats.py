@@ -37,7 +37,8 @@ async def created_scene(wanted: pb.CreateSceneRequest, connection: Connection, e
     def read(response: pb.GetSceneResponse) -> Scene:
         there = response.scene
         ours, theirs = _of_world(wanted), _of_world(there)
-        if there.generation != 1 or ours.shape != theirs.shape or not np.allclose(ours, theirs, rtol=0, atol=_SAME):
+        is_alike = ours.shape == theirs.shape and np.allclose(ours, theirs, rtol=0, atol=_SAME)
+        if there.generation != 1 or not is_alike or dict(wanted.labels) != dict(there.labels):
             raise error
         return scene_from_message(there)
 

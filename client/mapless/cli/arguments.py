@@ -241,20 +241,22 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
     create = actions.add_parser("create", help="create an empty scene")
     create.add_argument("scene")
     _add_place(create)
+    _add_labels(create, "what groups it with other scenes; may be repeated")
     create.set_defaults(run=commands.create_scene)
-    update = actions.add_parser("update", help="change its datum, direction of gravity, unit or calibration")
+    update = actions.add_parser("update", help="change its datum, direction of gravity, unit, labels or calibration")
     update.add_argument("scene")
     _add_place(update)
+    _add_labels(update, "label in place of all before; may be repeated")
     update.add_argument(
         "--forget",
         action="append",
         default=[],
-        choices=["datum", "down_in_world", "calibration"],
+        choices=["datum", "down_in_world", "calibration", "labels"],
         help="property to delete; may be repeated",
     )
     update.set_defaults(run=commands.update_scene)
     for action, others, run, text in (
-        ("get", ["show"], commands.get_scene, "its number of references, datum, unit and calibration"),
+        ("get", ["show"], commands.get_scene, "its number of references, datum, unit, labels and calibration"),
         ("delete", [], commands.delete_scene, "delete it with all of its references"),
     ):
         one = actions.add_parser(action, aliases=others, help=text)  # completion knows only those with a text
@@ -263,7 +265,19 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
             _add_yes(one)
         one.set_defaults(run=run)
     listing = actions.add_parser("list", help="all scenes")
+    _add_labels(listing, "only scenes with this label; may be repeated")
     listing.set_defaults(run=commands.list_scenes)
+
+
+def _label(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, such as site=a")
+    return name, value
+
+
+def _add_labels(command: argparse.ArgumentParser, text: str) -> None:
+    command.add_argument("--label", action="append", default=[], type=_label, metavar="NAME=VALUE", help=text)
 
 
 def _add_place(command: argparse.ArgumentParser) -> None:

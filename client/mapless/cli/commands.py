@@ -36,7 +36,13 @@ def create_scene(client: Client, arguments: argparse.Namespace) -> int:
     """Creates a scene."""
     datum, down = _datum(arguments), arguments.down
     is_arbitrary = arguments.unit == "arbitrary"
-    scene = client.create_scene(arguments.scene, datum=datum, down_in_world=down, arbitrary_unit=is_arbitrary)
+    scene = client.create_scene(
+        arguments.scene,
+        datum=datum,
+        down_in_world=down,
+        arbitrary_unit=is_arbitrary,
+        labels=dict(arguments.label),
+    )
     return show(arguments, scene, _scene_card(scene))
 
 
@@ -49,8 +55,10 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
         changes["down_in_world"] = arguments.down
     if arguments.unit is not None:
         changes["arbitrary_unit"] = arguments.unit == "arbitrary"
+    if arguments.label:
+        changes["labels"] = dict(arguments.label)
     if not changes:
-        raise ValueError("nothing to change: give --datum, --down, --unit or --forget")
+        raise ValueError("nothing to change: give --datum, --down, --unit, --label or --forget")
     scene = client.update_scene(arguments.scene, **changes)
     _warn(scene.warnings)
     return show(arguments, scene, _scene_card(scene))
@@ -87,6 +95,7 @@ def _scene_card(scene: Scene) -> list[str]:
         unit=_unit(scene),
         datum=f"{_place(scene.datum)}, {scene.datum.height_m:.2f} m" if scene.datum else None,
         down=None if down is None else " ".join(f"{it:.4f}" for it in down),
+        labels=_labels(scene) or None,
         calibration=f"measured with {calibration.query_count} photographs" if calibration else None,
         created=_minute(scene),
     )
@@ -96,11 +105,16 @@ def _unit(scene: Scene) -> str:
     return "arbitrary" if scene.arbitrary_unit else "m"
 
 
+def _labels(scene: Scene) -> str:
+    return ", ".join(f"{name}={value}" for name, value in sorted(scene.labels.items()))
+
+
 def list_scenes(client: Client, arguments: argparse.Namespace) -> int:
-    """Lists all scenes."""
-    scenes = list(client.list_scenes())
-    rows = [(it.scene_id, it.reference_count, _unit(it), _place(it.datum), _minute(it)) for it in scenes]
-    return show(arguments, scenes, table(("SCENE", "REFERENCES", "UNIT", "LATITUDE, LONGITUDE", "CREATED"), rows))
+    """Lists all scenes, or those with labels."""
+    scenes = list(client.list_scenes(labels=dict(arguments.label)))
+    rows = [(it.scene_id, it.reference_count, _unit(it), _place(it.datum), _minute(it), _labels(it)) for it in scenes]
+    head = "SCENE", "REFERENCES", "UNIT", "LATITUDE, LONGITUDE", "CREATED", "LABELS"
+    return show(arguments, scenes, table(head, rows))
 
 
 def _place(datum: Datum | None) -> str:

@@ -56,7 +56,14 @@ COVERAGE_VERDICT_DOUBTFUL: CoverageVerdict
 COVERAGE_VERDICT_NOT_LOCALIZABLE: CoverageVerdict
 
 class Scene(_message.Message):
-    __slots__ = ("name", "generation", "reference_count", "create_time", "datum", "down_in_world", "calibration", "arbitrary_unit")
+    __slots__ = ("name", "generation", "reference_count", "create_time", "datum", "down_in_world", "calibration", "arbitrary_unit", "labels")
+    class LabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     NAME_FIELD_NUMBER: _ClassVar[int]
     GENERATION_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -65,6 +72,7 @@ class Scene(_message.Message):
     DOWN_IN_WORLD_FIELD_NUMBER: _ClassVar[int]
     CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
     name: str
     generation: int
     reference_count: int
@@ -73,7 +81,8 @@ class Scene(_message.Message):
     down_in_world: _geometry_pb2.Vector3
     calibration: SceneCalibration
     arbitrary_unit: bool
-    def __init__(self, name: _Optional[str] = ..., generation: _Optional[int] = ..., reference_count: _Optional[int] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., calibration: _Optional[_Union[SceneCalibration, _Mapping]] = ..., arbitrary_unit: bool = ...) -> None: ...
+    labels: _containers.ScalarMap[str, str]
+    def __init__(self, name: _Optional[str] = ..., generation: _Optional[int] = ..., reference_count: _Optional[int] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., calibration: _Optional[_Union[SceneCalibration, _Mapping]] = ..., arbitrary_unit: bool = ..., labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class Datum(_message.Message):
     __slots__ = ("latitude_deg", "longitude_deg", "height_m", "enu_from_world")
@@ -154,16 +163,25 @@ class Provenance(_message.Message):
     def __init__(self, source: _Optional[_Union[PoseSource, str]] = ..., accuracy: _Optional[_Union[_localization_service_pb2.Accuracy, _Mapping]] = ...) -> None: ...
 
 class CreateSceneRequest(_message.Message):
-    __slots__ = ("scene_id", "datum", "down_in_world", "arbitrary_unit")
+    __slots__ = ("scene_id", "datum", "down_in_world", "arbitrary_unit", "labels")
+    class LabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     SCENE_ID_FIELD_NUMBER: _ClassVar[int]
     DATUM_FIELD_NUMBER: _ClassVar[int]
     DOWN_IN_WORLD_FIELD_NUMBER: _ClassVar[int]
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
     scene_id: str
     datum: Datum
     down_in_world: _geometry_pb2.Vector3
     arbitrary_unit: bool
-    def __init__(self, scene_id: _Optional[str] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., arbitrary_unit: bool = ...) -> None: ...
+    labels: _containers.ScalarMap[str, str]
+    def __init__(self, scene_id: _Optional[str] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., arbitrary_unit: bool = ..., labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class CreateSceneResponse(_message.Message):
     __slots__ = ("scene",)
@@ -208,12 +226,21 @@ class UpdateSceneResponse(_message.Message):
     def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class ListScenesRequest(_message.Message):
-    __slots__ = ("page_size", "page_token")
+    __slots__ = ("page_size", "page_token", "labels")
+    class LabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     PAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
     PAGE_TOKEN_FIELD_NUMBER: _ClassVar[int]
+    LABELS_FIELD_NUMBER: _ClassVar[int]
     page_size: int
     page_token: str
-    def __init__(self, page_size: _Optional[int] = ..., page_token: _Optional[str] = ...) -> None: ...
+    labels: _containers.ScalarMap[str, str]
+    def __init__(self, page_size: _Optional[int] = ..., page_token: _Optional[str] = ..., labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class ListScenesResponse(_message.Message):
     __slots__ = ("scenes", "next_page_token")

@@ -49,6 +49,7 @@ from .messages.references import (
     changes_from_message,
     choice_to_message,
     implausible_depths,
+    labels_from_message,
     nearly_ignored,
     new_provenance,
     reference_to_message,
@@ -97,7 +98,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         """Implements ReferenceService.CreateScene."""
         scene_id = wire.checked_id(request.scene_id, "scene_id")
         key, attributes = key_of(call.principal.tenant, scene_id), attributes_from_message(request)
-        scene = await self._stored(self._store.create_scene, key, attributes)
+        labels = labels_from_message(request.labels, "labels")
+        scene = await self._stored(self._store.create_scene, key, attributes, labels)
         return pb.CreateSceneResponse(scene=scene_to_message(scene))
 
     async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
@@ -144,7 +146,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             field = "datum" if changes.get("datum") else "arbitrary_unit"
             raise FieldError(f"scene.{field}", str(error)) from None
         warnings: list[str] = []
-        if changes.keys() != {"calibration"}:
+        if changes.keys() - {"calibration", "labels"}:
             warnings = await self._stored(self._contradictions, scene, MAX_COMPARED, call)
         return pb.UpdateSceneResponse(scene=scene_to_message(scene), warnings=warnings)
 
@@ -174,8 +176,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
         """Implements ReferenceService.ListScenes."""
         tenant = call.principal.tenant
-        page = Page(request, tenant, "scenes")
-        found = await self._stored(self._store.list_scenes, tenant, page.limit, page.after)
+        labels = labels_from_message(request.labels, "labels")
+        page = Page(request, tenant, f"scenes {sorted(labels.items())}" if labels else "scenes")
+        found = await self._stored(self._store.list_scenes, tenant, page.limit, page.after, labels)
         scenes, token = page.cut(found, lambda scene: scene.scene_id)
         return pb.ListScenesResponse(scenes=await _many(scene_to_message, scenes), next_page_token=token)
 

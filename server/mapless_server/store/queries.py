@@ -4,11 +4,12 @@
 reading the whole scene.
 """
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, insert, select, update
 from sqlalchemy.dialects import sqlite
 
 from mapless.names import reference_name, scene_name
@@ -17,7 +18,7 @@ from mapless_server.security import DEFAULT_TENANT, KEY_SEPARATOR, SceneKey, end
 
 from . import rows
 from .database import unless_damaged
-from .records import IndexedReference, SceneChanges
+from .records import IndexedReference, SceneChanges, SceneRecord
 from .tables import (
     features,
     global_descriptor,
@@ -26,6 +27,7 @@ from .tables import (
     scene,
     scene_calibration,
     scene_generation,
+    scene_label,
 )
 
 DETACHED = "-/"
@@ -49,12 +51,33 @@ def select_scenes() -> Select[Any]:
     )
 
 
-def select_scenes_of(tenant: str, after: str) -> Select[Any]:
-    """The same columns for the scenes of one tenant with ids greater than `after`, ordered by id."""
+def select_scenes_of(tenant: str, after: str, labels: Mapping[str, str]) -> Select[Any]:
+    """The same columns for the scenes of a tenant with all these labels and ids greater than `after`, ordered by id."""
     key = scene.c.scene_id
     # Not LIKE: to SQLite, "acme/%" is "ACME/%".
     is_theirs = ~key.contains(KEY_SEPARATOR) if tenant == DEFAULT_TENANT else key < end_of_keys(tenant)
-    return select_scenes().where(key > key_of(tenant, after), is_theirs).order_by(key)
+    found = select_scenes().where(key > key_of(tenant, after), is_theirs)
+    for name, value in labels.items():
+        label = scene_label.c
+        found = found.where(key.in_(select(label.scene_id).where(label.name == name, label.value == value)))
+    return found.order_by(key)
+
+
+def read_scenes(connection: Connection, found: Sequence[Row[Any]]) -> list[SceneRecord]:
+    """Makes the records of rows of `select_scenes`; raises DataLoss if the attributes of one are damaged."""
+    column, labels = scene_label.c, defaultdict[str, dict[str, str]](dict)
+    for some in _portions([row.scene_id for row in found]):
+        for label in connection.execute(select(scene_label).where(column.scene_id.in_(some)).order_by(column.name)):
+            labels[label.scene_id][label.name] = label.value
+    return [rows.scene_record(row, labels[row.scene_id]) for row in found]
+
+
+def replace_labels(connection: Connection, scene_key: SceneKey, labels: Mapping[str, str]) -> None:
+    """Replaces the labels of a scene."""
+    connection.execute(delete(scene_label).where(scene_label.c.scene_id == scene_key))
+    if labels:
+        added = [{"scene_id": scene_key, "name": name, "value": value} for name, value in labels.items()]
+        connection.execute(insert(scene_label), added)
 
 
 def find_scene(connection: Connection, scene_key: SceneKey) -> Row[Any]:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial, wraps
+from types import MappingProxyType
 from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
 
 from sqlalchemy import Connection, Row, Select, Table, select
@@ -31,6 +32,7 @@ from .records import (
 P = ParamSpec("P")
 T = TypeVar("T")
 
+NO_LABELS: Mapping[str, str] = MappingProxyType({})
 NAME_CACHE_BYTES = 16 * 2**20
 NAME_BYTES = 300
 """About the size of a reference's id and key in memory."""
@@ -132,7 +134,7 @@ class StoreReader:
     def get_scene(self, scene_key: SceneKey) -> SceneRecord:
         """Returns a scene; NotFound if there is no such scene; DataLoss if its attributes are damaged."""
         with self.database.read() as connection:
-            return rows.scene_record(queries.find_scene(connection, scene_key))
+            return queries.read_scenes(connection, [queries.find_scene(connection, scene_key)])[0]
 
     @observed
     def get_generation(self, scene_key: SceneKey) -> int:
@@ -167,14 +169,16 @@ class StoreReader:
         return scene
 
     @observed
-    def list_scenes(self, tenant: str, limit: int, after: str = "") -> list[SceneRecord]:
-        """At most `limit` scenes of a tenant, ordered by id, with ids greater than `after`.
+    def list_scenes(
+        self, tenant: str, limit: int, after: str = "", labels: Mapping[str, str] = NO_LABELS
+    ) -> list[SceneRecord]:
+        """At most `limit` scenes of a tenant with all these labels, ordered by id, with ids greater than `after`.
 
         DataLoss if the attributes of one of them are damaged.
         """
-        page = queries.select_scenes_of(tenant, after).limit(limit)
+        page = queries.select_scenes_of(tenant, after, labels).limit(limit)
         with self.database.read() as connection:
-            return [rows.scene_record(row) for row in connection.execute(page)]
+            return queries.read_scenes(connection, connection.execute(page).all())
 
     @observed
     def has_features(self, key: str, extractor: str) -> bool:

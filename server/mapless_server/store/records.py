@@ -139,6 +139,7 @@ class SceneRecord:
         reference_count: number of references.
         create_time: when it was created, UTC.
         attributes: attributes of the scene.
+        labels: what groups it with other scenes, value by name.
     """
 
     scene_key: SceneKey
@@ -146,6 +147,7 @@ class SceneRecord:
     reference_count: int
     create_time: datetime
     attributes: SceneAttributes = SceneAttributes()
+    labels: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def scene_id(self) -> str:

@@ -3,7 +3,7 @@
 import hashlib
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from typing import Any
@@ -51,10 +51,10 @@ def now_us() -> int:
     return round(time.time() * 1e6)
 
 
-def scene_record(row: Row[Any]) -> SceneRecord:
+def scene_record(row: Row[Any], labels: Mapping[str, str]) -> SceneRecord:
     """Makes the record of a row of `queries.select_scenes`; raises DataLoss if the attributes are damaged."""
     key, created = SceneKey(row.scene_id), time_of(row.create_time_us)
-    return SceneRecord(key, row.generation, row.reference_count, created, scene_attributes(row))
+    return SceneRecord(key, row.generation, row.reference_count, created, scene_attributes(row), labels)
 
 
 def attributes_row(scene_key: SceneKey, attributes: SceneAttributes) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -26,7 +26,7 @@ from .database import DamagedPages, Database, with_room_to_delete
 from .deletion import PendingDeletions
 from .depth_images import encode_depth_image
 from .postgresql import PostgresqlDatabase
-from .reader import NAME_CACHE_BYTES, StoreReader, observed
+from .reader import NAME_CACHE_BYTES, NO_LABELS, StoreReader, observed
 from .records import DescribedReference, NewReference, ReferenceRecord, SceneAttributes, SceneRecord
 from .sqlite import SqliteDatabase
 
@@ -105,7 +105,12 @@ class Store(StoreReader):
         self.close()
 
     @observed
-    def create_scene(self, scene_key: SceneKey, attributes: SceneAttributes = NO_ATTRIBUTES) -> SceneRecord:
+    def create_scene(
+        self,
+        scene_key: SceneKey,
+        attributes: SceneAttributes = NO_ATTRIBUTES,
+        labels: Mapping[str, str] = NO_LABELS,
+    ) -> SceneRecord:
         """Creates a scene without references; AlreadyExists if the id is taken."""
         now, scene = _now(), tables.scene
         with self.changing() as connection:
@@ -116,7 +121,8 @@ class Store(StoreReader):
                 raise AlreadyExists(message, field="scene_id", resource=scene_name(scene_id))
             row = {"scene_id": scene_key, "create_time_us": rows.time_us(now), "first_generation": generation}
             connection.execute(insert(scene).values(row | rows.attributes_row(scene_key, attributes)))
-            return rows.scene_record(queries.find_scene(connection, scene_key))
+            queries.replace_labels(connection, scene_key, labels)
+            return queries.read_scenes(connection, [queries.find_scene(connection, scene_key)])[0]
 
     @observed
     def update_scene(
@@ -127,8 +133,9 @@ class Store(StoreReader):
         down_in_world: Vector | UnchangedType | None = UNCHANGED,
         calibration: Calibration | UnchangedType | None = UNCHANGED,
         arbitrary_unit: bool | UnchangedType = UNCHANGED,
+        labels: Mapping[str, str] | UnchangedType = UNCHANGED,
     ) -> SceneRecord:
-        """Changes attributes of a scene; None deletes an attribute.
+        """Changes attributes of a scene, and all of its labels together; None deletes an attribute.
 
         Damaged attributes are replaced if datum, down_in_world and calibration are given; then the unit is the metre
         unless it is given. NotFound if there is no such scene; DataLoss if an attribute that is not given is damaged;
@@ -151,7 +158,9 @@ class Store(StoreReader):
                     raise
             row = rows.attributes_row(scene_key, replace(found, **changes))
             connection.execute(update(tables.scene).where(tables.scene.c.scene_id == scene_key).values(row))
-            return rows.scene_record(queries.find_scene(connection, scene_key))
+            if labels is not UNCHANGED:
+                queries.replace_labels(connection, scene_key, labels)
+            return queries.read_scenes(connection, [queries.find_scene(connection, scene_key)])[0]
 
     @observed
     def delete_scene(self, scene_key: SceneKey) -> frozenset[str]:

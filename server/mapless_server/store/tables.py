@@ -16,7 +16,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 12
+SCHEMA_VERSION = 13
 
 metadata = MetaData()
 
@@ -53,6 +53,16 @@ scene = Table(
     # See codec.py; both are null for a scene without attributes.
     Column("attributes", LargeBinary),
     Column("attributes_sha256", _Sha256),
+)
+
+# What groups scenes; by value, so that the scenes of a group are found without reading the others.
+scene_label = Table(
+    "scene_label",
+    metadata,
+    Column("scene_id", _SceneKey, ForeignKey("scene.scene_id", ondelete="CASCADE"), primary_key=True),
+    Column("name", String(64), primary_key=True),
+    Column("value", String(128), nullable=False),
+    Index("scene_label_by_value", "name", "value"),
 )
 
 # Outlives the scene, so that a scene created again with the same id does not repeat generations.

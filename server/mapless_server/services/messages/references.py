@@ -2,6 +2,7 @@
 
 import base64
 import binascii
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -27,6 +28,8 @@ from .queries import message_of
 
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000
+MAX_LABELS, MAX_LABEL_VALUE = 32, 128
+_LABEL_NAME = re.compile("[A-Za-z0-9._-]{1,64}")
 
 Record = TypeVar("Record")
 
@@ -163,6 +166,7 @@ def scene_to_message(scene: SceneRecord) -> pb.Scene:
         down_in_world=wire.vector_to_message(known.down_in_world) if known.down_in_world else None,
         calibration=calibration_to_message(known.calibration) if known.calibration else None,
         arbitrary_unit=known.arbitrary_unit,
+        labels=scene.labels,
     )
     message.create_time.FromDatetime(scene.create_time)
     return message
@@ -182,6 +186,19 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
         raise FieldError("down_in_world", str(error)) from None
     except DatumWithoutMetres as error:
         raise FieldError("datum", str(error)) from None
+
+
+def labels_from_message(labels: Mapping[str, str], field: str) -> dict[str, str]:
+    """Reads the labels of a scene, or those that scenes shall have; FieldError names a wrong one."""
+    if len(labels) > MAX_LABELS:
+        raise FieldError(field, f"must have at most {MAX_LABELS} labels, has {len(labels)}")
+    for name, value in labels.items():
+        if not _LABEL_NAME.fullmatch(name):
+            raise FieldError(field, f"must have names of 1 to 64 of A-Z a-z 0-9 . _ -, has {names.shown(name)}")
+        if not 1 <= len(value) <= MAX_LABEL_VALUE or not value.isprintable():
+            bounds = f"1 to {MAX_LABEL_VALUE} printable characters"
+            raise FieldError(field, f"must have values of {bounds}, {name!r} has {names.shown(value)}")
+    return dict(labels)
 
 
 def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:
@@ -220,4 +237,5 @@ _READERS: dict[str, Callable[[pb.Scene, str], object]] = {
     "down_in_world": _optional(direction_from_message),
     "calibration": _optional(_measured),
     "arbitrary_unit": lambda scene, path: scene.arbitrary_unit,
+    "labels": lambda scene, path: labels_from_message(scene.labels, joined("scene", path)),
 }
