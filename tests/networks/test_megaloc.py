@@ -22,7 +22,7 @@ from mapless_server.method.features.views import View
 from mapless_server.networks.megaloc import signed_groups, transport
 from mapless_server.networks.weights import CheckpointError, named
 from mapless_server.networks.weights.install import add
-from mapless_server.scenes import GlobalDescriptor
+from mapless_server.scenes.retrieval.index import GlobalDescriptor
 from mapless_server.scenes.retrieval.megaloc import SIDE_PX, MegaLocDescriptor
 
 PUBLISHED = {

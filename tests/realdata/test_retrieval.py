@@ -8,8 +8,8 @@ import pytest
 
 from mapless_server.images import ImageLimits, decode_image
 from mapless_server.method.features.extractors import SiftExtractor
-from mapless_server.scenes import RankedReference, RankOptions, Selection, Vector, rank_references
-from mapless_server.scenes.retrieval.index import SceneIndex
+from mapless_server.scenes import RankedReference, RankOptions, Selection, rank_references
+from mapless_server.scenes.retrieval.index import SceneIndex, Vector
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.store import IndexedReference, SceneChanges
 from mapless_tools.dataset import Dataset, Frame

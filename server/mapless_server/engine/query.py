@@ -27,7 +27,8 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.judge.answer import Answer
     from mapless_server.method.options import LocalizeOptions
     from mapless_server.method.pipeline import Pipeline
-    from mapless_server.scenes import Choice, Narrowing, Vector
+    from mapless_server.scenes import Choice, Narrowing
+    from mapless_server.scenes.retrieval.index import Vector
     from mapless_server.scheduling import Flow
     from mapless_server.security import SceneKey
     from mapless_server.store import SceneState

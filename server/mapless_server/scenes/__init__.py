@@ -6,6 +6,5 @@ May import store, security, method, networks and images. Begin with `library` (l
 """
 
 from .audit.verdict import AuditVerdict, Coverage, CoverageVerdict, ReferenceAudit, Viewpoint
-from .retrieval.index import GlobalDescriptor, Vector
 from .retrieval.narrowing import ANYWHERE, Cone, Narrowing, Sphere
 from .retrieval.ranking import Choice, RankedReference, RankOptions, Selection, rank_references

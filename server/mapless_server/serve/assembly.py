@@ -20,7 +20,6 @@ from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsError, WeightsMissing, find_weights
 from mapless_server.observability.metrics import Metrics
-from mapless_server.scenes import GlobalDescriptor
 from mapless_server.scenes.audit.neighbourhood import PairMatches
 from mapless_server.scenes.audit.scene_auditor import SceneTools
 from mapless_server.scenes.background import BackgroundMatching, SceneWork
@@ -30,6 +29,7 @@ from mapless_server.scenes.depth_checks import DepthChecks
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
+from mapless_server.scenes.retrieval.index import GlobalDescriptor
 from mapless_server.scenes.retrieval.vlad import VladDescriptor
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.scenes.stored import DepthFinder, PairFinder, TierMatching

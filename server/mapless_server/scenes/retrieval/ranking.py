@@ -9,9 +9,12 @@ Of few candidates whose features are loaded, those with the most matches are cho
 the photographs and the references' poses only, never the query's pose.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +23,10 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.bounds import check_bounds
 from mapless_server.method.bundle.priors import PosePrior
 
-from .index import Entries, Rows, Vector
 from .narrowing import Narrowing
+
+if TYPE_CHECKING:  # services that exchange choices need not load the index
+    from .index import Entries, Rows, Vector
 
 
 @dataclass(frozen=True)
