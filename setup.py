@@ -16,11 +16,11 @@ KERNELS = [
         f"mapless_server.kernels._{name}",
         [f"server/mapless_server/kernels/_{name}.c"],
         define_macros=[("Py_LIMITED_API", "0x030B0000")],
-        extra_compile_args=["-O3", "-ffp-contract=off"],
+        extra_compile_args=["-O3", f"-ffp-contract={contracted}"],
         py_limited_api=True,
         optional=True,
     )
-    for name in ("adjustment", "nearest")
+    for name, contracted in (("adjustment", "off"), ("edgepoint2", "fast"), ("nearest", "off"))
 ]
 HAS_INTERFACE = sys.version_info >= (3, 11) and not sysconfig.get_config_var("Py_GIL_DISABLED")
 IS_PURE = os.environ.get("MAPLESS_PURE") == "1" or not HAS_INTERFACE

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from support.scenes import random_for
 
 torch = pytest.importorskip("torch", reason="the networks extra is not installed")
@@ -13,6 +14,7 @@ import torch.nn.functional as F  # noqa: E402, N812  its usual name
 from safetensors.torch import save_file  # noqa: E402
 from torch import Tensor  # noqa: E402
 
+from mapless_server.kernels import edgepoint2 as kernel  # noqa: E402
 from mapless_server.networks.edgepoint2 import EdgePoint2, TorchEdgePoint2, fuse  # noqa: E402
 from mapless_server.networks.edgepoint2_sizes import VARIANTS  # noqa: E402
 from mapless_server.networks.local_features import load_edgepoint2  # noqa: E402
@@ -87,20 +89,42 @@ def test_the_fused_network_computes_the_same(variant: str) -> None:
         torch.testing.assert_close(ours, expected, atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("is_compiled", [False, True])
 @pytest.mark.parametrize("size", [(96, 130), (64, 320), (9, 7)])
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_onnx_runtime_computes_the_same(variant: str, size: tuple[int, int], tmp_path: Path) -> None:
+def test_onnx_runtime_computes_the_same(
+    variant: str, size: tuple[int, int], is_compiled: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With its last layers by ONNX Runtime, and by compiled code; at keypoints beyond the outermost pixels, too."""
+    if is_compiled and not kernel.is_available():
+        pytest.skip("not compiled, or no AVX2")
+    monkeypatch.setattr(kernel, "is_available", lambda: is_compiled)
     onnx = pytest.importorskip("mapless_server.networks.edgepoint2_onnx", reason="ONNX Runtime is not installed")
     file = tmp_path / "weights.safetensors"
     save_file(random_network(variant).state_dict(), file)
     grey = random_for("grey", size).integers(0, 256, size).astype(np.uint8)
     plain, ours = TorchEdgePoint2(variant, file), onnx.OnnxEdgePoint2(variant, file)
     assert plain.sha256 == ours.sha256
-    (logits, features), (our_logits, our_features) = plain.maps(grey), ours.maps(grey)
+    (logits, describe), (our_logits, our_describe) = plain.maps(grey), ours.maps(grey)
     np.testing.assert_allclose(our_logits, logits, atol=1e-3, rtol=1e-4)
-    np.testing.assert_allclose(our_features, features, atol=1e-3, rtol=1e-4)
-    samples = features.reshape(len(features), -1).T[:50].copy()
-    np.testing.assert_allclose(ours.describe(samples), plain.describe(samples), atol=1e-3, rtol=1e-4)
+    keypoints = random_for("keypoints", size).uniform(-6, 6, (60, 2)) + random_for("at", size).uniform(
+        0, size[::-1], (60, 2)
+    )
+    np.testing.assert_allclose(our_describe(keypoints), describe(keypoints), atol=1e-3, rtol=1e-4)
+    assert our_describe(keypoints[:0]).shape == (0, 64)
+
+
+@pytest.mark.skipif(not kernel.is_available(), reason="not compiled, or no AVX2")
+def test_maps_of_another_size_are_errors() -> None:
+    def zeros(*shape: int) -> NDArray[np.float32]:
+        return np.zeros(shape, np.float32)
+
+    first, layers = kernel.layer(zeros(8, 8, 1, 1), zeros(8)), [kernel.layer(zeros(8, 8, 3, 3), zeros(8))] * 3
+    with pytest.raises(ValueError, match="do not fit"):
+        kernel.scores(zeros(8, 16, 16), zeros(8, 4, 4), zeros(8, 1, 1), first, layers)
+    quarter, group = kernel.layer(zeros(64, 8, 1, 1), zeros(64)), kernel.grouped(zeros(64, 16, 3, 3), zeros(64))
+    with pytest.raises(ValueError, match="do not fit"):
+        kernel.samples(zeros(8, 9, 8), zeros(4, 4, 64), zeros(1, 1, 64), quarter, group, np.zeros((1, 2)))
 
 
 def test_onnx_names_the_weights_that_do_not_fit(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from .checkpoint import load_strictly
-from .edgepoint2_sizes import GROUP, MULTIPLE_PX, VARIANTS, Widths
+from .edgepoint2_heads import sampled
+from .edgepoint2_sizes import GROUP, MULTIPLE_PX, VARIANTS, Describe, Widths
 
 
 class Convolution(nn.Module):
@@ -122,21 +123,20 @@ class TorchEdgePoint2:
         self._device = torch.device(device)
         self._network = fuse(network.eval()).to(self._device)
 
-    @torch.inference_mode()
-    def maps(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Logits (H, W) and the map (C, H', W') for `describe` of a grey image (H, W)."""
-        # Transferred as bytes, a quarter of the size of floats.
-        image = torch.from_numpy(np.ascontiguousarray(grey)).to(self._device)[None, None].float() / 255
-        logits, features = self._network(image)
-        return logits[0, 0].cpu().numpy(), features[0].cpu().contiguous().numpy()
+    def maps(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float32], Describe]:
+        """Logits (H, W) of a grey image (H, W), and what returns descriptors at keypoints; see `Describe`."""
+        with torch.inference_mode():
+            # Transferred as bytes, a quarter of the size of floats.
+            image = torch.from_numpy(np.ascontiguousarray(grey)).to(self._device)[None, None].float() / 255
+            logits, features = self._network(image)
+            feature_map: NDArray[np.float32] = features[0].cpu().contiguous().numpy()
 
-    @torch.inference_mode()
-    def describe(self, samples: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Descriptors (N, D), not normalized, of samples (N, C) of the map."""
-        described: NDArray[np.float32] = (
-            self._network.describe(torch.from_numpy(samples).to(self._device)).cpu().numpy()
-        )
-        return described
+        def describe(keypoints: NDArray[np.float64]) -> NDArray[np.float32]:
+            with torch.inference_mode():
+                samples = torch.from_numpy(sampled(feature_map, keypoints)).to(self._device)
+                return np.asarray(self._network.describe(samples).cpu().numpy())
+
+        return logits[0, 0].cpu().numpy(), describe
 
 
 def fuse(network: EdgePoint2) -> EdgePoint2:

@@ -1,7 +1,8 @@
 """EdgePoint2 as a graph of ONNX, computed by ONNX Runtime: without torch, which takes a second and 200 MB to load.
 
 It is the network of `edgepoint2`, in whose docstrings is how, with batch normalizations moved into the convolutions. On
-one core of a CPU both take the same time.
+one core of a CPU both take the same time. Where the processor has AVX2, the last layers, which take two thirds of it,
+are compiled code (`edgepoint2_heads`).
 """
 
 import hashlib
@@ -15,15 +16,15 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx.onnx_ml_pb2 import ModelProto, NodeProto
 from safetensors.numpy import load
 
-from .edgepoint2_sizes import GROUP, MULTIPLE_PX, VARIANTS, Widths
+from mapless_server.kernels import edgepoint2 as kernel
+
+from .edgepoint2_heads import TRUNK, CompiledHeads, fused, parts, sampled
+from .edgepoint2_sizes import GROUP, MULTIPLE_PX, VARIANTS, Describe, Widths
 from .weights.catalogue import CheckpointError
 from .weights.safetensors_header import check_fit, opened, read_header
 
 Float = NDArray[np.float32]
 Shapes = Mapping[str, tuple[int, ...]]
-
-BATCH_EPSILON = 1e-5
-"""Added to variances by batch normalization, as torch does."""
 
 CONTRAST_EPSILON = 1e-5
 """Added to the variance of a photograph, which may be of one colour."""
@@ -43,24 +44,29 @@ class OnnxEdgePoint2:
         widths = VARIANTS[variant]
         arrays, self.sha256 = _read(weights, widths)
         self._last, self._last_bias = arrays["desc_head.2.weight"][:, :, 0, 0].T, arrays["desc_head.2.bias"]
+        self._heads = CompiledHeads(widths, arrays) if kernel.is_available() else None
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # several photographs are described at a time
-        model = graph_of(widths, arrays).SerializeToString()  # type: ignore[no-untyped-call]
+        graph = trunk_of(widths, arrays) if self._heads else graph_of(widths, arrays)
+        model = graph.SerializeToString()  # type: ignore[no-untyped-call]
         self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
-    def maps(self, grey: NDArray[np.uint8]) -> tuple[Float, Float]:
-        """Logits (H, W) and the map (C, H', W') for `describe` of a grey image (H, W)."""
+    def maps(self, grey: NDArray[np.uint8]) -> tuple[Float, Describe]:
+        """Logits (H, W) of a grey image (H, W), and what returns descriptors at keypoints; see `Describe`."""
         height, width = grey.shape
         image = grey.astype(np.float32) / 255
         image -= image.mean()
         image /= np.sqrt(np.square(image).mean() + CONTRAST_EPSILON)
         padded = np.pad(image, ((0, -height % MULTIPLE_PX), (0, -width % MULTIPLE_PX)))
-        logits, features = map(np.asarray, self._session.run(["logits", "features"], {"image": padded[None, None]}))
-        return logits[0, 0, :height, :width], features[0]
+        names = TRUNK if self._heads else ("logits", "features")
+        found = [np.asarray(it)[0] for it in self._session.run(names, {"image": padded[None, None]})]
+        logits = self._heads.logits(found) if self._heads else found[0][0]
 
-    def describe(self, samples: Float) -> Float:
-        """Descriptors (N, D), not normalized, of samples (N, C) of the map."""
-        return np.asarray(samples @ self._last + self._last_bias)
+        def describe(keypoints: NDArray[np.float64]) -> Float:
+            samples = self._heads.samples(found, keypoints) if self._heads else sampled(found[1], keypoints)
+            return np.asarray(samples @ self._last + self._last_bias)
+
+        return logits[:height, :width], describe
 
 
 def shapes_of(widths: Widths) -> Shapes:
@@ -108,10 +114,7 @@ def graph_of(widths: Widths, weights: Mapping[str, Float]) -> ModelProto:
     The image is normalized and padded.
     """
     graph = _Graph(weights)
-    half = graph.residual(graph.convolution(graph.convolution("image", "block1.0", stride=2), "block1.1"), "block1.2")
-    quarter = graph.pooled(half, 2)
-    eighth = graph.residual(graph.pooled(quarter, 2), "block2")
-    last = graph.residual(graph.pooled(eighth, 4), "block3")
+    half, quarter, eighth, last = graph.trunk()
     scores = graph.plain(half, "conv1"), graph.plain(eighth, "conv2"), graph.plain(last, "conv3")
     score = graph.added(scores, (1, 4, 16))
     for layer in (0, 2):
@@ -121,8 +124,18 @@ def graph_of(widths: Widths, weights: Mapping[str, Float]) -> ModelProto:
     joined = graph.added(graph.parts([quarter, eighth, last], "desc_head.0", widths), (1, 2, 8))
     joint = widths.half + widths.eighth + widths.last
     graph.node("Identity", graph.convolution(joined, "desc_head.1", groups=joint // GROUP), name="features")
-    outputs = {"logits": (1, 1, None, None), "features": (1, joint, None, None)}
-    return graph.model({"image": (1, 1, "height", "width")}, outputs)
+    return graph.model({"logits": 1, "features": joint})
+
+
+def trunk_of(widths: Widths, weights: Mapping[str, Float]) -> ModelProto:
+    """The graph of the maps that `CompiledHeads` take, each (1, C, H', W'), of "image" as in `graph_of`."""
+    graph = _Graph(weights)
+    maps = graph.trunk()
+    _, _, eighth, last = maps
+    for name, x in zip(TRUNK, (*maps, graph.plain(eighth, "conv2"), graph.plain(last, "conv3")), strict=True):
+        graph.node("Identity", x, name=name)
+    channels = widths.half, widths.half, widths.eighth, widths.last, widths.score, widths.score
+    return graph.model(dict(zip(TRUNK, channels, strict=True)))
 
 
 class _Graph:
@@ -152,13 +165,17 @@ class _Graph:
     def plain(self, x: str, name: str) -> str:
         return self.convolved(x, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
 
+    def trunk(self) -> tuple[str, str, str, str]:
+        """The maps at 1/2, 1/4, 1/8 and 1/32 of the image's size."""
+        half = self.convolution(self.convolution("image", "block1.0", stride=2), "block1.1")
+        half = self.residual(half, "block1.2")
+        quarter = self.pooled(half, 2)
+        eighth = self.residual(self.pooled(quarter, 2), "block2")
+        return half, quarter, eighth, self.residual(self.pooled(eighth, 4), "block3")
+
     def normalized(self, x: str, name: str, layer: int, stride: int = 1, groups: int = 1) -> str:
         """A convolution and the batch normalization after it."""
-        of, weight = f"{name}.layer.{layer + 1}", self._weights[f"{name}.layer.{layer}.weight"]
-        mean, variance = self._weights[f"{of}.running_mean"], self._weights[f"{of}.running_var"]
-        factor = self._weights[f"{of}.weight"] / np.sqrt(variance + np.float32(BATCH_EPSILON))
-        bias = self._weights[f"{of}.bias"] - mean * factor
-        return self.convolved(x, weight * factor[:, None, None, None], bias, stride, groups)
+        return self.convolved(x, *fused(self._weights, name, layer), stride, groups)
 
     def convolution(self, x: str, name: str, stride: int = 1, groups: int = 1) -> str:
         return self.node("Relu", self.normalized(x, name, 0, stride, groups))
@@ -182,21 +199,17 @@ class _Graph:
         return total
 
     def parts(self, values: Sequence[str], name: str, widths: Widths) -> list[str]:
-        """A 1x1 convolution of joined maps, as one of each, whose results are added; it commutes with enlarging."""
-        ends = np.cumsum([widths.half, widths.eighth])
-        weights = np.split(self._weights[f"{name}.weight"], ends, axis=1)
-        biases = self._weights[f"{name}.bias"], None, None
+        """A 1x1 convolution of joined maps, as one of each, whose results are added."""
+        weights, biases = parts(self._weights[f"{name}.weight"], widths), (self._weights[f"{name}.bias"], None, None)
         return [self.convolved(*it) for it in zip(values, weights, biases, strict=True)]
 
-    def model(
-        self,
-        inputs: Mapping[str, Sequence[int | str | None]],
-        outputs: Mapping[str, Sequence[int | str | None]],
-    ) -> ModelProto:
-        values_in, values_out = (
-            [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in these.items()]
-            for these in (inputs, outputs)
-        )
+    def model(self, outputs: Mapping[str, int]) -> ModelProto:
+        """The model with these outputs, by name, each of so many channels."""
+        values_in = [helper.make_tensor_value_info("image", TensorProto.FLOAT, (1, 1, "height", "width"))]
+        values_out = [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, (1, channels, None, None))
+            for name, channels in outputs.items()
+        ]
         graph = helper.make_graph(self._nodes, "edgepoint2", values_in, values_out, self._constants)
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
 

@@ -1,7 +1,13 @@
 """The sizes of EdgePoint2's maps, for the implementations by torch (`edgepoint2`) and ONNX (`edgepoint2_onnx`)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Describe = Callable[[NDArray[np.float64]], NDArray[np.float32]]
+"""What returns descriptors (N, D), not normalized, at keypoints (N, 2) of a photograph, x and y in pixels."""
 
 MULTIPLE_PX = 32
 """Sides of the images that the layers take; `EdgePoint2` pads others."""

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from mapless_server.method.features.extractors.options import LearnedOptions  # 
 from mapless_server.method.features.extractors.xfeat import SHIFT_PX, XfeatExtractor  # noqa: E402
 from mapless_server.method.features.masks import MARGIN_PX  # noqa: E402
 from mapless_server.networks.edgepoint2 import EdgePoint2  # noqa: E402
+from mapless_server.networks.edgepoint2_heads import sampled  # noqa: E402
 from mapless_server.networks.edgepoint2_sizes import VARIANTS  # noqa: E402
 from mapless_server.networks.weights import CheckpointError  # noqa: E402
 
@@ -199,10 +201,9 @@ def test_edgepoint2_features_are_read_at_the_peaks_of_the_maps(
         logits = np.maximum(logits, 5 - 0.3 * ((x - cx) ** 2 + (y - cy) ** 2))
     # The middles of the 4x4 pixels that a descriptor is for: of an image that is padded to 320x256.
     column, row = np.meshgrid(np.arange(80) * 4 + 1.5, np.arange(64) * 4 + 1.5)
-    feature_map = np.stack([column, row, np.full(column.shape, 200.0)])
-    maps = tuple(it.astype(np.float32) for it in (logits, feature_map))
+    feature_map = np.stack([column, row, np.full(column.shape, 200.0)]).astype(np.float32)
+    maps = logits.astype(np.float32), partial(sampled, feature_map)
     monkeypatch.setattr(edgepoint2._network, "maps", lambda _: maps)
-    monkeypatch.setattr(edgepoint2._network, "describe", lambda samples: samples)
     camera = replace(CAMERA, height_px=250)
     view = edgepoint2.extract(np.zeros((250, 320, 3), np.uint8), camera)
     assert view.camera == camera

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
-from mapless_server.networks.edgepoint2_sizes import DESCRIPTOR_STEP_PX
+from mapless_server.networks.edgepoint2_sizes import Describe
 
 from ..masks import usable_pixels
 from ..views import Ignored, View, reduce_image, view_of
@@ -34,12 +34,8 @@ class EdgePoint2Network(Protocol):
     sha256: str
     """Identity of the weights."""
 
-    def maps(self, grey: NDArray[np.uint8]) -> tuple[Float, Float]:
-        """Logits (H, W) and the map (C, H', W') for `describe` of a grey image (H, W)."""
-        ...
-
-    def describe(self, samples: Float) -> Float:
-        """Descriptors (N, D), not normalized, of samples (N, C) of the map."""
+    def maps(self, grey: NDArray[np.uint8]) -> tuple[Float, Describe]:
+        """Logits (H, W) of a grey image (H, W), and what returns descriptors at keypoints."""
         ...
 
 
@@ -59,18 +55,18 @@ class EdgePoint2Extractor:
         """See FeatureExtractor.extract; the strongest keypoint first."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
         reduced, reduced_camera = reduce_image(grey, camera, self.options.max_side_px)
-        logits, feature_map = self._network.maps(reduced)
+        logits, describe = self._network.maps(reduced)
         row, column = _strict_maxima(logits, _logit(self.options.min_score))
         if ignored is not None:
             usable = usable_pixels(ignored, reduced.shape[1], reduced.shape[0])[row, column]
             row, column = row[usable], column[usable]
         order = np.argsort(-logits[row, column], kind="stable")[: self.options.max_keypoints]
         offsets, curvatures = _peaks(logits, (row[order], column[order]))
-        keypoints = np.stack([column[order], row[order]], axis=1) + offsets
-        described = self._network.describe(_sampled(feature_map, keypoints))
+        keypoints = (np.stack([column[order], row[order]], axis=1) + offsets).astype(np.float64)
+        described = describe(keypoints)
         return view_of(
             reduced_camera,
-            keypoints.astype(np.float64),
+            keypoints,
             described / np.maximum(np.linalg.norm(described, axis=1, keepdims=True), np.float32(1e-12)),
             SIZE_OF_WIDTH / np.sqrt(-curvatures.max(axis=1)),
         )
@@ -118,22 +114,3 @@ def _peaks(logits: Float, at: Pixels) -> tuple[Float, Float]:
     after = np.stack([logits[row, column + 1], logits[row + 1, column]], axis=1)
     curvatures = before + after - 2 * here[:, None]
     return np.asarray((before - after) / 2 / curvatures), np.asarray(curvatures)
-
-
-def _sampled(feature_map: Float, keypoints: NDArray[np.floating]) -> Float:
-    """Samples a map (D, H, W) at keypoints, (N, D), between its pixels, which lie side by side from the image's corner.
-
-    Beyond the outermost pixels' centres it falls to zero.
-    """
-    places = (keypoints + 0.5) / DESCRIPTOR_STEP_PX - 0.5
-    first = np.floor(places).astype(np.intp)
-    right, low = (places - first).astype(np.float32).T
-    _, height, width = feature_map.shape
-    flat, sampled = feature_map.reshape(len(feature_map), -1), np.zeros((len(feature_map), len(places)), np.float32)
-    for down, across in (0, 0), (0, 1), (1, 0), (1, 1):
-        column, row = first[:, 0] + across, first[:, 1] + down
-        weight = (right if across else 1 - right) * (low if down else 1 - low)
-        weight *= (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        pixel = row.clip(0, height - 1) * width + column.clip(0, width - 1)
-        sampled += np.take(flat, pixel, axis=1) * weight
-    return sampled.T

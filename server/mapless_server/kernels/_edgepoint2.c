@@ -1,0 +1,413 @@
+/* The heads of EdgePoint2: scores of all pixels, and descriptors where there are keypoints; see edgepoint2.py.
+ *
+ * Scores go through their layers row by row, so that what lies between these stays in the cache. The map that descriptors
+ * are sampled from is computed at the pixels that a keypoint samples alone, a quarter of all.
+ */
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+/* Compiled for wider vectors too, of which the dynamic linker takes the widest of the processor. */
+#if defined(__x86_64__) && defined(__GNUC__) && __GNUC__ >= 12 && defined(__GLIBC__)
+#define WIDE __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+#define IS_FAST (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
+#else
+#define WIDE
+#define IS_FAST 0
+#endif
+#ifdef __clang__
+#define UNROLLED _Pragma("clang loop unroll(full)")
+#else
+#define UNROLLED _Pragma("GCC unroll 16")
+#endif
+#define ALWAYS static inline __attribute__((always_inline))
+
+typedef Py_ssize_t Index;
+
+enum { LANES = 16, SIDE = 3, TAPS = SIDE * SIDE, BLOCK = 8, PIXELS = 8, STEP_PX = 4, SQUARE = 2 };
+
+/* Sixteen floats, by whatever vectors the processor has. */
+typedef float Lanes __attribute__((vector_size(LANES * sizeof(float))));
+
+ALWAYS void load(Lanes *to, const float *from) { memcpy(to, from, sizeof(*to)); }
+ALWAYS void store(float *to, const Lanes *from) { memcpy(to, from, sizeof(*from)); }
+ALWAYS void relu(float *values, Index count) {
+    for (Index i = 0; i < count; i++) values[i] = values[i] > 0 ? values[i] : 0;
+}
+
+/* Where a map is read between its pixels after it is enlarged by a factor: the pixel before, the one after, its share. */
+static void between(Index pixel, Index factor, Index size, Index *before, Index *after, float *share) {
+    const float place = ((float)pixel + 0.5f) / (float)factor - 0.5f;
+    const Index first = (Index)floorf(place);
+    *share = place - (float)first;
+    *before = first < 0 ? 0 : first;
+    *after = first + 1 < size ? first + 1 : size - 1;
+}
+
+/* A map (channels, height, width) made wider by a factor, (channels, height, factor * width). */
+static void widen(const float *map, Index rows, Index width, Index factor, float *to) {
+    for (Index x = 0; x < factor * width; x++) {
+        Index before, after;
+        float share;
+        between(x, factor, width, &before, &after, &share);
+        for (Index r = 0; r < rows; r++) {
+            const float *row = map + r * width;
+            to[r * factor * width + x] = row[before] * (1 - share) + row[after] * share;
+        }
+    }
+}
+
+/* Adds row y of a map that is as wide as the result, enlarged in height by a factor. */
+ALWAYS void add_row(const float *map, Index channels, Index height, Index width, Index factor, Index y, float *to,
+                    Index stride) {
+    Index before, after;
+    float share;
+    between(y, factor, height, &before, &after, &share);
+    for (Index c = 0; c < channels; c++) {
+        const float *first = map + (c * height + before) * width, *second = map + (c * height + after) * width;
+        for (Index x = 0; x < width; x++) to[c * stride + x] += first[x] * (1 - share) + second[x] * share;
+    }
+}
+
+/* Sixteen pixels of some channels of a row: 3x3 taps of `sources` with the weights (in, 9, out) from channel `first` on. */
+ALWAYS void convolve(const float *const rows[SIDE], Index stride, Index sources, const float *weights, Index results,
+                     const float *bias, Index first, int count, Index x, int is_relu, float *to) {
+    Lanes sums[BLOCK], pixels;
+    UNROLLED
+    for (int k = 0; k < count; k++) sums[k] = (Lanes){0} + bias[first + k];
+    for (Index c = 0; c < sources; c++)
+        for (int t = 0; t < TAPS; t++) {
+            load(&pixels, rows[t / SIDE] + c * stride + x + t % SIDE - 1);
+            const float *w = weights + (c * TAPS + t) * results + first;
+            UNROLLED
+            for (int k = 0; k < count; k++) sums[k] += pixels * w[k];
+        }
+    UNROLLED
+    for (int k = 0; k < count; k++) {
+        float *its = to + (first + k) * stride + x;
+        store(its, &sums[k]);
+        if (is_relu) relu(its, LANES);
+    }
+}
+
+typedef struct {
+    const float *weights, *bias; /* (in, 9, out), (out) */
+} Layer;
+
+typedef struct {
+    const float *half, *weights, *bias;  /* (C, H, W), (C, S), (S) */
+    const float *eighth, *last;          /* (S, H / 4, W), (S, H / 16, W): widened */
+    Layer layers[SIDE];                  /* S to S, S to S, S to 4 */
+    Index channels, scores, height, width;
+} ScoreHead;
+
+/* Row y of the sum of the three maps' scores. */
+ALWAYS void sum_row(const ScoreHead *head, Index y, float *to, Index stride) {
+    const Index plane = head->height * head->width;
+    for (Index first = 0; first < head->scores; first += BLOCK)
+        for (Index x = 0; x < head->width; x += LANES) {
+            Lanes sums[BLOCK], pixels;
+            UNROLLED
+            for (int k = 0; k < BLOCK; k++) sums[k] = (Lanes){0} + head->bias[first + k];
+            for (Index c = 0; c < head->channels; c++) {
+                load(&pixels, head->half + c * plane + y * head->width + x);
+                const float *w = head->weights + c * head->scores + first;
+                UNROLLED
+                for (int k = 0; k < BLOCK; k++) sums[k] += pixels * w[k];
+            }
+            UNROLLED
+            for (int k = 0; k < BLOCK; k++) store(to + (first + k) * stride + x, &sums[k]);
+        }
+    add_row(head->eighth, head->scores, head->height / 4, head->width, 4, y, to, stride);
+    add_row(head->last, head->scores, head->height / 16, head->width, 16, y, to, stride);
+}
+
+/* Logits (2 H, 2 W). Each of three rings holds the last four rows of a layer; rows beyond the map are zeros. */
+enum { RING = 4, RINGS = 3 };
+
+static Index ring_row(const ScoreHead *head) { return head->scores * (head->width + 2 * LANES); }
+
+WIDE static void compute_scores(const ScoreHead *head, float *memory, float *logits) {
+    const Index stride = head->width + 2 * LANES, size = ring_row(head), height = head->height, width = head->width;
+    const float *nothing = memory + RINGS * RING * size + LANES;
+    float *last = memory + (RINGS * RING + 1) * size + LANES;
+#define ROW(ring, y) (memory + ((ring) * RING + ((y) & (RING - 1))) * size + LANES)
+    for (Index y = 0; y < height + SIDE; y++) {
+        if (y < height) sum_row(head, y, ROW(0, y), stride);
+        for (Index layer = 0; layer < SIDE; layer++) {
+            const Index at = y - 1 - layer; /* this layer's row, whose three sources are there */
+            if (at < 0 || at >= height) continue;
+            const float *rows[SIDE];
+            for (Index r = 0; r < SIDE; r++) {
+                const Index source = at + r - 1;
+                rows[r] = source < 0 || source >= height ? nothing : ROW(layer, source);
+            }
+            const Layer *its = &head->layers[layer];
+            for (Index x = 0; x < width; x += LANES) {
+                if (layer == SIDE - 1)
+                    convolve(rows, stride, head->scores, its->weights, SQUARE * SQUARE, its->bias, 0, SQUARE * SQUARE, x, 0,
+                             last);
+                else
+                    for (Index first = 0; first < head->scores; first += BLOCK)
+                        convolve(rows, stride, head->scores, its->weights, head->scores, its->bias, first, BLOCK, x, 1,
+                                 ROW(layer + 1, at));
+            }
+            if (layer < SIDE - 1) continue;
+            for (Index a = 0; a < SQUARE; a++) {
+                const float *even = last + SQUARE * a * stride, *odd = even + stride;
+                float *to = logits + (SQUARE * at + a) * SQUARE * width;
+                for (Index x = 0; x < width; x++) to[2 * x] = even[x], to[2 * x + 1] = odd[x];
+            }
+        }
+    }
+#undef ROW
+}
+
+typedef struct {
+    const float *quarter, *weights, *bias; /* (C, H, W), (C, J), (J) */
+    const float *eighth, *last;            /* (H / 2, W / 2, J), (H / 8, W / 8, J) */
+    const float *grouped, *grouped_bias;   /* (J / 16, 9, 16, 16) by group, tap, source and result; (J) */
+    Index channels, joint, height, width;
+} DescriptorHead;
+
+/* Row y of the sum of the three maps, where it is needed. */
+ALWAYS void join_row(const DescriptorHead *head, Index y, const uint8_t *needed, float *blended, float *to) {
+    const Index width = head->width, joint = head->joint, plane = head->height * width;
+    const float *maps[2] = {head->eighth, head->last};
+    for (int m = 0; m < 2; m++) {
+        const Index factor = m ? 8 : 2, its_width = width / factor;
+        Index before, after;
+        float share;
+        between(y, factor, head->height / factor, &before, &after, &share);
+        const float *first = maps[m] + before * its_width * joint, *second = maps[m] + after * its_width * joint;
+        float *row = blended + m * (width / 2) * joint;
+        for (Index i = 0; i < its_width * joint; i++) row[i] = first[i] * (1 - share) + second[i] * share;
+    }
+    for (Index x = 0; x < width; x++) {
+        if (!needed[x]) continue;
+        const float *sources[4];
+        float shares[4];
+        for (int m = 0; m < 2; m++) {
+            Index before, after;
+            float share;
+            between(x, m ? 8 : 2, width / (m ? 8 : 2), &before, &after, &share);
+            const float *row = blended + m * (width / 2) * joint;
+            sources[2 * m] = row + before * joint, sources[2 * m + 1] = row + after * joint;
+            shares[2 * m] = 1 - share, shares[2 * m + 1] = share;
+        }
+        float pixel[LANES];
+        for (Index c = 0; c < head->channels; c++) pixel[c] = head->quarter[c * plane + y * width + x];
+        for (Index j = 0; j < joint; j += LANES) {
+            Lanes sums, other;
+            load(&sums, head->bias + j);
+            for (Index c = 0; c < head->channels; c++) load(&other, head->weights + c * joint + j), sums += pixel[c] * other;
+            for (int m = 0; m < 4; m++) load(&other, sources[m] + j), sums += shares[m] * other;
+            store(to + x * joint + j, &sums);
+        }
+    }
+}
+
+/* The map after its grouped 3x3 layer, at pixels (count) of the map; `joined` is surrounded by zeros. */
+WIDE static void convolve_groups(const DescriptorHead *head, const float *joined, const Index *pixels, Index count,
+                                 float *to) {
+    const Index joint = head->joint, wide = head->width + 2;
+    for (Index g = 0; g < joint / LANES; g++) {
+        Lanes bias;
+        load(&bias, head->grouped_bias + g * LANES);
+        for (Index i = 0; i < count; i += PIXELS) {
+            const float *sources[PIXELS];
+            Lanes sums[PIXELS], weights;
+            UNROLLED
+            for (int p = 0; p < PIXELS; p++) {
+                const Index pixel = pixels[i + p < count ? i + p : count - 1];
+                sources[p] = joined + (pixel / head->width * wide + pixel % head->width) * joint + g * LANES;
+                sums[p] = bias;
+            }
+            for (int t = 0; t < TAPS; t++) {
+                const Index shift = (t / SIDE * wide + t % SIDE) * joint;
+                const float *its = head->grouped + (g * TAPS + t) * LANES * LANES;
+                for (int c = 0; c < LANES; c++) {
+                    load(&weights, its + c * LANES);
+                    UNROLLED
+                    for (int p = 0; p < PIXELS; p++) sums[p] += sources[p][shift + c] * weights;
+                }
+            }
+            for (int p = 0; p < PIXELS && i + p < count; p++) {
+                store(to + (i + p) * joint + g * LANES, &sums[p]);
+                relu(to + (i + p) * joint + g * LANES, LANES);
+            }
+        }
+    }
+}
+
+WIDE static void join(const DescriptorHead *head, const uint8_t *needed, float *blended, float *joined) {
+    const Index wide = head->width + 2;
+    for (Index y = 0; y < head->height; y++)
+        join_row(head, y, needed + y * head->width, blended, joined + ((y + 1) * wide + 1) * head->joint);
+}
+
+/* The four pixels around a keypoint and their shares; -1 beyond the map, where it is zero. */
+static void corners(const DescriptorHead *head, const double keypoint[2], Index pixels[4], float shares[4]) {
+    const double x = (keypoint[0] + 0.5) / STEP_PX - 0.5, y = (keypoint[1] + 0.5) / STEP_PX - 0.5;
+    const double left = floor(x), top = floor(y);
+    const float right = (float)(x - left), low = (float)(y - top);
+    for (int i = 0; i < 4; i++) {
+        const double column = left + i % 2, row = top + i / 2;
+        const int is_inside = column >= 0 && column < (double)head->width && row >= 0 && row < (double)head->height;
+        pixels[i] = is_inside ? (Index)row * head->width + (Index)column : -1;
+        shares[i] = (i % 2 ? right : 1 - right) * (i / 2 ? low : 1 - low);
+    }
+}
+
+/* Samples (count, J) of the map at keypoints (count, 2), x and y in pixels of the photograph. 0 without memory. */
+static int sample(const DescriptorHead *head, const double *keypoints, Index count, float *samples) {
+    const Index width = head->width, height = head->height, joint = head->joint, size = width * height;
+    Index *rows = malloc((size_t)(2 * size + 1) * sizeof(Index)), *pixels = rows + size; /* of each pixel; the pixels */
+    uint8_t *needed = calloc((size_t)size, 1);
+    float *joined = calloc((size_t)((width + 2) * (height + 2) * joint), sizeof(float));
+    float *blended = malloc((size_t)(width * joint) * sizeof(float)), *map = NULL;
+    int done = rows && needed && joined && blended;
+    if (done) {
+        Index found = 0, around[4];
+        float shares[4];
+        for (Index i = 0; i < size; i++) rows[i] = -1;
+        for (Index k = 0; k < count; k++) {
+            corners(head, keypoints + 2 * k, around, shares);
+            for (int i = 0; i < 4; i++)
+                if (around[i] >= 0) rows[around[i]] = 0;
+        }
+        for (Index i = 0; i < size; i++) {
+            if (rows[i] < 0) continue;
+            rows[i] = found, pixels[found++] = i;
+            const Index x = i % width, y = i / width;
+            for (Index v = y ? y - 1 : 0; v <= y + 1 && v < height; v++)
+                for (Index u = x ? x - 1 : 0; u <= x + 1 && u < width; u++) needed[v * width + u] = 1;
+        }
+        map = malloc((size_t)(found * joint + 1) * sizeof(float));
+        done = map != NULL;
+        if (done) {
+            join(head, needed, blended, joined);
+            convolve_groups(head, joined, pixels, found, map);
+            memset(samples, 0, (size_t)(count * joint) * sizeof(float));
+            for (Index k = 0; k < count; k++) {
+                corners(head, keypoints + 2 * k, around, shares);
+                for (int i = 0; i < 4; i++) {
+                    if (around[i] < 0) continue;
+                    const float *its = map + rows[around[i]] * joint;
+                    for (Index j = 0; j < joint; j++) samples[k * joint + j] += shares[i] * its[j];
+                }
+            }
+        }
+    }
+    free(rows), free(needed), free(joined), free(blended), free(map);
+    return done;
+}
+
+enum { MOST_ARRAYS = 12 };
+
+typedef struct {
+    Py_buffer buffers[MOST_ARRAYS];
+    int count;
+} Arrays;
+
+static void release(Arrays *arrays) {
+    while (arrays->count) PyBuffer_Release(&arrays->buffers[--arrays->count]);
+}
+
+/* The arrays after so many numbers, of which the last is written to; 0 with an exception. */
+static int acquire(PyObject *arguments, Index *numbers, int first, int count, Arrays *arrays) {
+    arrays->count = 0;
+    if (PyTuple_Size(arguments) != first + count) {
+        PyErr_SetString(PyExc_TypeError, "the number of arguments is wrong");
+        return 0;
+    }
+    for (int i = 0; i < first; i++) {
+        numbers[i] = PyLong_AsSsize_t(PyTuple_GetItem(arguments, i));
+        if (PyErr_Occurred()) return 0;
+        if (numbers[i] < 1 || numbers[i] > 1 << 16) {
+            PyErr_SetString(PyExc_ValueError, "a size is out of range");
+            return 0;
+        }
+    }
+    for (; arrays->count < count; arrays->count++) {
+        const int flags = PyBUF_C_CONTIGUOUS | (arrays->count == count - 1 ? PyBUF_WRITABLE : 0);
+        if (PyObject_GetBuffer(PyTuple_GetItem(arguments, first + arrays->count), &arrays->buffers[arrays->count], flags)) {
+            release(arrays);
+            return 0;
+        }
+    }
+    return 1;
+}
+
+static int have_bytes(const Arrays *arrays, const Index *lengths) {
+    for (int i = 0; i < arrays->count; i++)
+        if (arrays->buffers[i].len != lengths[i]) return 0;
+    return 1;
+}
+
+static PyObject *sizes_do_not_fit(Arrays *arrays) {
+    release(arrays);
+    PyErr_SetString(PyExc_ValueError, "the sizes of the arrays do not fit");
+    return NULL;
+}
+
+static PyObject *scores_call(PyObject *Py_UNUSED(module), PyObject *arguments) {
+    Arrays a;
+    Index sizes[4];
+    if (!acquire(arguments, sizes, 4, 12, &a)) return NULL;
+    const Index c = sizes[0], s = sizes[1], h = sizes[2], w = sizes[3], f = sizeof(float);
+    const Index lengths[] = {c * h * w * f, c * s * f,        s * f, s * (h / 4) * (w / 4) * f, s * (h / 16) * (w / 16) * f,
+                             s * TAPS * s * f, s * f,      s * TAPS * s * f, s * f,      s * TAPS * 4 * f, 4 * f, 4 * h * w * f};
+    if (s % BLOCK || h % 16 || w % 16 || !have_bytes(&a, lengths)) return sizes_do_not_fit(&a);
+    ScoreHead head = {a.buffers[0].buf, a.buffers[1].buf, a.buffers[2].buf, NULL, NULL, {{0}}, c, s, h, w};
+    for (int i = 0; i < SIDE; i++)
+        head.layers[i].weights = a.buffers[5 + 2 * i].buf, head.layers[i].bias = a.buffers[6 + 2 * i].buf;
+    const Index rings = (RINGS * RING + 2) * s * (w + 2 * LANES), eighth = s * (h / 4) * w, last = s * (h / 16) * w;
+    float *memory = calloc((size_t)(rings + eighth + last), sizeof(float));
+    if (memory) {
+        Py_BEGIN_ALLOW_THREADS
+        widen(a.buffers[3].buf, s * (h / 4), w / 4, 4, memory + rings);
+        widen(a.buffers[4].buf, s * (h / 16), w / 16, 16, memory + rings + eighth);
+        head.eighth = memory + rings, head.last = memory + rings + eighth;
+        compute_scores(&head, memory, a.buffers[11].buf);
+        Py_END_ALLOW_THREADS
+    }
+    free(memory);
+    release(&a);
+    return memory ? Py_NewRef(Py_None) : PyErr_NoMemory();
+}
+
+static PyObject *samples_call(PyObject *Py_UNUSED(module), PyObject *arguments) {
+    Arrays a;
+    Index sizes[4];
+    if (!acquire(arguments, sizes, 4, 9, &a)) return NULL;
+    const Index c = sizes[0], j = sizes[1], h = sizes[2], w = sizes[3], f = sizeof(float);
+    const Index count = a.buffers[7].len / (2 * (Index)sizeof(double));
+    const Index lengths[] = {c * h * w * f, c * j * f, j * f, j * (h / 2) * (w / 2) * f, j * (h / 8) * (w / 8) * f,
+                             j * TAPS * LANES * f, j * f, count * 2 * (Index)sizeof(double), count * j * f};
+    if (j % LANES || c > LANES || h % 8 || w % 8 || !have_bytes(&a, lengths)) return sizes_do_not_fit(&a);
+    const DescriptorHead head = {a.buffers[0].buf, a.buffers[1].buf, a.buffers[2].buf, a.buffers[3].buf, a.buffers[4].buf,
+                                 a.buffers[5].buf, a.buffers[6].buf, c, j, h, w};
+    int done;
+    Py_BEGIN_ALLOW_THREADS
+    done = sample(&head, a.buffers[7].buf, count, a.buffers[8].buf);
+    Py_END_ALLOW_THREADS
+    release(&a);
+    return done ? Py_NewRef(Py_None) : PyErr_NoMemory();
+}
+
+static PyObject *is_fast(PyObject *Py_UNUSED(module), PyObject *Py_UNUSED(arguments)) {
+    return PyBool_FromLong(IS_FAST);
+}
+
+static PyMethodDef methods[] = {
+    {"is_fast", is_fast, METH_NOARGS, "Whether this processor has the vectors that it is compiled for."},
+    {"scores", scores_call, METH_VARARGS, "Writes logits; see edgepoint2.py."},
+    {"samples", samples_call, METH_VARARGS, "Writes samples of the descriptors' map; see edgepoint2.py."},
+    {NULL, NULL, 0, NULL},
+};
+static struct PyModuleDef definition = {PyModuleDef_HEAD_INIT, "_edgepoint2", NULL, 0, methods, NULL, NULL, NULL, NULL};
+PyMODINIT_FUNC PyInit__edgepoint2(void) { return PyModuleDef_Init(&definition); }
