@@ -31,7 +31,16 @@ from .answers import (
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
 from .depth import DepthImage, DepthNoise, DepthSensor, IgnoredDepth
-from .diagnostics import Attempt, Debug, DepthCheck, Diagnostics, LadderCut, ReferenceUse, ScaleEstimate
+from .diagnostics import (
+    Attempt,
+    Debug,
+    DepthCheck,
+    Diagnostics,
+    LadderCut,
+    MissingEvidence,
+    ReferenceUse,
+    ScaleEstimate,
+)
 from .errors import (
     AlreadyExists,
     DataLoss,
@@ -63,7 +72,7 @@ from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from .provenance import Provenance
 from .requests import IntrinsicsUncertainty, NewReference
-from .results import Coverage, Reference, ReferenceAudit, RetrievedReference, Scene
+from .results import Coverage, PendingWork, Reference, ReferenceAudit, RetrievedReference, Scene
 from .scenes import UNCHANGED, Calibration
 from .shortcut import localize
 
@@ -106,8 +115,10 @@ __all__ = [
     "LadderCut",
     "LocalizationResult",
     "MaplessError",
+    "MissingEvidence",
     "NewReference",
     "NotFound",
+    "PendingWork",
     "PermissionDenied",
     "PosePrior",
     "PositionPrior",

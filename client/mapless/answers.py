@@ -289,6 +289,7 @@ class LocalizationResult:
             text.append(f"  points    {points}")
         text += [f"  depth     {it}" for it in (self.diagnostics.depth_check,) if it is not None]
         text += [f"  cut       {it}" for it in self.diagnostics.ladder_cuts]
+        text += [f"  missing   {it}" for it in self.diagnostics.missing_evidence]
         if self.arbitrary_unit:
             text.append("  warning   the scene's unit of length is arbitrary, not the metre")
         if self.scale_source == "NETWORK":
@@ -339,7 +340,7 @@ class Rejected:
             text += [f"  the pose that is too imprecise{frame}:", *pose_lines(pose, it.accuracy, it.arbitrary_unit)]
         check = self.diagnostics.depth_check
         text += [f"  the photograph's depth: {check.refusal}"] if check is not None and check.refusal else []
-        text += [f"  {it}" for it in self.diagnostics.ladder_cuts]
+        text += [f"  {it}" for it in (*self.diagnostics.ladder_cuts, *self.diagnostics.missing_evidence)]
         if self.diagnostics.captured:
             text.append(f"  {_CAPTURED}")
         return "\n".join(text)

@@ -85,6 +85,27 @@ class LadderCut:
         return f"{self.rung} left out or not finished: {reason}"
 
 
+@dataclass(frozen=True)
+class MissingEvidence:
+    """Something that references lacked for a photograph, because the server has not made it in the background yet.
+
+    Attributes:
+        kind: "features", "retrieval", "matches" or "calibration".
+        name: of the features, vectors or matches.
+        reference_count: references of the scene that lacked it.
+        made_reference_count: of these, those for which this call made it.
+    """
+
+    kind: str
+    name: str
+    reference_count: int
+    made_reference_count: int = 0
+
+    def __str__(self) -> str:
+        made = f", {self.made_reference_count} of them made now" if self.made_reference_count else ""
+        return f"{self.reference_count} references had no {self.kind} yet ({self.name}){made}"
+
+
 _CUT_REASONS = {
     "NO_TIME": "no time",
     "CALLER_FAILS": "this caller's last photographs all failed, and others ask",
@@ -164,6 +185,7 @@ class Diagnostics:
         attempts: the attempts that were made, in order; none of a server older than 0.4.
         ladder_cuts: attempts that were left out or not finished for lack of time or memory, or because others ask;
             asking again may help.
+        missing_evidence: what references lacked for further attempts; asking again later may help.
         depth_check: how the photograph's depth compares with the answer; None without depth, and of a server before
             0.4, which ignores it.
     """
@@ -189,6 +211,7 @@ class Diagnostics:
     attempts: tuple[Attempt, ...] = ()
     ladder_cuts: tuple[LadderCut, ...] = ()
     depth_check: DepthCheck | None = None
+    missing_evidence: tuple[MissingEvidence, ...] = ()
 
     @property
     def is_tracked(self) -> bool:

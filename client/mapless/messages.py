@@ -21,7 +21,7 @@ from .geodesy import Datum, GeoPose
 from .geometry import Array, Camera, Quaternion, RigidTransform, Similarity
 from .groups import GroupRejected, ImageReport, RigLocalization, SequenceLocalization
 from .provenance import Provenance, provenance_from_message
-from .results import Reference, Scene
+from .results import PendingWork, Reference, Scene
 from .scenes import Calibration, Vector, calibration_from_message, datum_from_message, direction_from_message
 from .v1 import localization_service_pb2 as pb
 from .v1 import reference_service_pb2 as reference_pb
@@ -204,6 +204,8 @@ def scene_from_message(message: reference_pb.Scene, response: Any = None) -> Sce
     found = {name: getattr(response, name) for name in _SAID_OF_SCENES if hasattr(response, name)}
     if "warnings" in found:
         found["warnings"] = tuple(found["warnings"])
+    if isinstance(response, reference_pb.GetSceneResponse):
+        found["pending_work"] = tuple(PendingWork(it.kind, it.name, it.reference_count) for it in response.pending_work)
     scene_id, labels = names.parse_scene_name(message.name), dict(message.labels)
     return read(Scene, message, scene_id=scene_id, labels=labels, **found)
 

@@ -12,6 +12,24 @@ from .scenes import Calibration, Vector
 
 
 @dataclass(frozen=True)
+class PendingWork:
+    """Work that the server has still to do in the background.
+
+    Attributes:
+        kind: "features", "matches" or "calibration".
+        name: of the features or matches.
+        reference_count: references that wait for it.
+    """
+
+    kind: str
+    name: str
+    reference_count: int
+
+    def __str__(self) -> str:
+        return f"{self.kind} of {self.reference_count} references ({self.name})"
+
+
+@dataclass(frozen=True)
 class Scene:
     """A set of references that share one world frame; `generation` is raised by every change.
 
@@ -28,6 +46,7 @@ class Scene:
             do not agree with their poses; empty if it does not, or is not known to. Of `get_scene` alone.
         compared_pair_count: pairs of references that show enough in common to be compared with their poses.
         agreeing_pair_count: how many of these agree with them.
+        pending_work: what the server has still to make of its references in the background; of `get_scene` alone.
     """
 
     scene_id: str
@@ -43,6 +62,7 @@ class Scene:
     contradiction: str = ""
     compared_pair_count: int = 0
     agreeing_pair_count: int = 0
+    pending_work: tuple[PendingWork, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

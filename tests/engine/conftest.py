@@ -25,7 +25,7 @@ def setting(tmp_path: Path) -> Iterator[Setting]:
         setting = Setting(store)
         store.create_scene(SCENE)
         photos = [Photo(encode(".png", textured(seed=i)), CAMERA, "image") for i in range(3)]
-        described = setting.describe(photos)
+        described = setting.describe_all(photos)
         store.add_references(
             SCENE,
             [

@@ -30,7 +30,7 @@ from support.planted_engine import (
 from support.servers import CAMERA, PHOTO, StandInExtractor, pose
 
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import Photo, Result, Tier
+from mapless_server.engine.query import CutReason, MissingEvidence, Photo, Result, Tier
 from mapless_server.engine.search import SearchJob
 from mapless_server.engine.stages import MAX_LISTINGS
 from mapless_server.errors import InvalidArgument, Unavailable
@@ -39,6 +39,7 @@ from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.judge import LEVELS, JudgeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.scenes import Narrowing, Sphere
+from mapless_server.scenes.later import Pending
 from mapless_server.scheduling import CostModel
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, SelfCalibration, calibrations
@@ -190,25 +191,61 @@ class TestTiers:
             f"{advice} Trying it with stronger features was not finished: asking again, when less is asked, may help."
         )
 
-    def test_a_better_answer_never_waits_for_feature_extraction(self, setting: Setting) -> None:
-        """It is done after the call, once, and the next doubtful query has the better answer."""
+    def test_a_query_makes_the_features_it_needs_and_stores_them(self, setting: Setting) -> None:
         setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
-        photo = encode(".png", textured(seed=7))
-        of_cheap = View(CAMERA, setting.extractors["cheap"].extract(textured(seed=7), CAMERA).features)
-        new = NewReference("late", photo, CAMERA, pose(9.0), {"cheap": of_cheap})
-        setting.store.add_references(SCENE, [new])
-        names = []
-        for _ in range(200):
+        add_late(setting)
+        missing = []
+        for _ in range(2):
             result = setting.localize(reference_ids=("r0", "late"))
-            names.append(result.tier.extractor.name)
-            if names[-1] == "strong":
-                break
-            assert result.attempts[-1].outcome == "unfinished"
-            time.sleep(0.02)
-        assert names[0] == "cheap"
-        assert names[-1] == "strong"
-        seen = setting.extractors["strong"].seen
-        assert sum(np.array_equal(image, textured(seed=7)) for image in seen) == 1
+            assert result.tier.extractor.name == "strong"
+            missing.append(result.missing)
+        assert missing == [(MissingEvidence("features", "strong", 1, 1),), ()]
+        assert times_seen(setting, "strong") == 1
+
+    def test_features_there_is_no_time_for_are_made_after_the_call(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
+        add_late(setting)
+        monkeypatch.setattr("mapless_server.engine.search.MAKE_S", 0.0)
+        result = setting.localize(reference_ids=("r0", "late"))
+        assert (result.tier.extractor.name, result.attempts[-1].outcome) == ("cheap", "unfinished")
+        assert [it.reason for it in result.cuts] == [CutReason.FEATURES_MISSING]
+        assert result.missing == (MissingEvidence("features", "strong", 1, 0),)
+        until_s = time.monotonic() + 20
+        while setting.localize(reference_ids=("r0", "late")).tier.extractor.name != "strong":
+            assert time.monotonic() < until_s
+        assert times_seen(setting, "strong") == 1
+
+    def test_an_attempt_is_made_with_the_references_that_have_features(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": localized(SURE_INLIERS)}
+        add_late(setting)
+        monkeypatch.setattr("mapless_server.engine.search.MAKE_S", 0.0)
+        result = setting.localize(reference_ids=(), reference_count=4)
+        assert result.tier.extractor.name == "strong"
+        assert {it.name[-2:] for it in result.references} == {"r0", "r1", "r2"}
+        assert result.missing == (MissingEvidence("features", "strong", 1, 0),)
+
+    def test_while_references_lack_something_a_doubt_takes_bounded_time(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        answered = threading.Event()
+
+        def endless(*_: object) -> Answer:
+            assert answered.wait(20)
+            return localized(SURE_INLIERS)
+
+        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": endless}
+        setting.engine.references.pending = lambda _: (Pending("matches", "strong (network)", 7),)
+        monkeypatch.setattr("mapless_server.engine.search.LACKING_S", 0.5)
+        begin_s = time.monotonic()
+        result = setting.localize(deadline_s=60.0)
+        assert time.monotonic() - begin_s < 10
+        answered.set()
+        assert (result.tier.extractor.name, [it.reason for it in result.cuts]) == ("cheap", [CutReason.NO_TIME])
+        assert result.missing == (MissingEvidence("matches", "strong (network)", 7),)
 
     def test_tiers_share_neither_names_nor_what_remembers_matches(self, setting: Setting) -> None:
         cheap, strong = setting.engine.tiers
@@ -329,6 +366,19 @@ class TestDescribingReferences:
         (took_s,) = (it.end_s - it.start_s for it in job.records if it.stage == "prepare")
         assert took_s - seconds >= 2 * self.STEP_S
         assert seconds >= self.STEP_S, "the photograph's own description is part of it"
+
+
+def add_late(setting: Setting) -> None:
+    """A reference that lacks the stronger features."""
+    photo = encode(".png", textured(seed=7))
+    (found,) = setting.describe([Photo(photo, CAMERA, "image")])
+    new = NewReference("late", photo, CAMERA, pose(9.0), found.views, found.descriptors)
+    setting.store.add_references(SCENE, [new])
+
+
+def times_seen(setting: Setting, features: str) -> int:
+    """How often such features were sought in that reference."""
+    return sum(np.array_equal(it, textured(seed=7)) for it in setting.extractors[features].seen)
 
 
 def add_undescribed(setting: Setting, count: int) -> None:

@@ -33,7 +33,7 @@ def make_anew(setting: Setting) -> Callable[[], None]:
     photos = [Photo(encode(".png", textured(seed=10 + i)), CAMERA, "image") for i in range(len(NAMES))]
     to_add = [
         NewReference(name, photo.image, CAMERA, pose(x_m), found.views, found.descriptors)
-        for name, photo, x_m, found in zip(NAMES, photos, sorted(SECOND), setting.describe(photos), strict=True)
+        for name, photo, x_m, found in zip(NAMES, photos, sorted(SECOND), setting.describe_all(photos), strict=True)
     ]
 
     def make() -> None:

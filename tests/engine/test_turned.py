@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from support.compare import pose_error
 from support.corner import CAMERA, photograph, pose
+from support.described import describe_all
 from support.images import encode, textured, with_exif_orientation
 
 from mapless.geometry import Camera, RigidTransform
@@ -92,7 +93,7 @@ def localizing(
     with Store.open(folder) as store:
         options = EngineOptions(doubt=DoubtOptions(doubtful_trust))
         engine = engine_over(store, tiers, options)
-        described = loop.run_until_complete(engine.describe([it.photo for it in shots], caller))
+        described = describe_all(engine, [it.photo for it in shots])
         store.create_scene(SCENE)
         references = [
             NewReference(name, it.photo.image, it.photo.camera, it.world_from_camera, found.views, found.descriptors)

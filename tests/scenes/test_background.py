@@ -277,7 +277,7 @@ class TestDamage:
         assert server.counts.failures == 1
         assert server.counts.made == 6
         assert server.counts.waits == 1
-        assert "reference r3 of scene s could not be matched, next time in 30 s" in caplog.text
+        assert "reference r3 of scene s could not be described or matched, next time in 30 s" in caplog.text
         server.background.match_waiting()
         assert server.counts.failures == 1
         let_pass(monkeypatch, 31)
@@ -471,11 +471,11 @@ class TestPriority:
 
     def test_a_reference_deleted_after_its_claim_is_no_failure(self, store: Store) -> None:
         server = Server(store)
-        found = server.background._claim()
+        found = server.background._claim(server.background._all)
         assert found is not None
         store.delete_reference(SCENE, found[1].reference_id)
         with closing(ReferenceLibrary(store)) as library:
-            server.background._match_claimed(library, *found)
+            server.background._work_on_claimed(library, *found)
         assert server.counts.failures == 0
 
     def test_what_is_made_before_the_claim_ends_is_stored(

@@ -1,5 +1,6 @@
 """References are loaded with the requested features, described once, and with photographs that are read when used."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -149,11 +150,11 @@ class TestDescribing:
         new, library = Picky("new"), ReferenceLibrary(store)
         for _ in range(3):
             with pytest.raises(FeaturesMissing):
-                library.load(SCENE, IDS, new, context(), waits=False)
+                library.load(SCENE, IDS, new, StageContext(make_until_s=-math.inf))
         others = [it for it in IDS if it != "r1"]
         for _ in range(500):
             with suppress(FeaturesMissing):
-                library.load(SCENE, others, new, context(), waits=False)
+                library.load(SCENE, others, new, StageContext(make_until_s=-math.inf))
                 break
             time.sleep(0.01)
         library.close()

@@ -1,6 +1,7 @@
 """Scenes in memory: a damaged reference affects no other one, and memory is counted."""
 
 import logging
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from support.stores import damage
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.options import StageContext
 from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.library import FeaturesMissing, ReferenceLibrary
+from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, SceneChanges, Store
 
@@ -40,27 +41,20 @@ def indexes_of(store: Store, capacity_bytes: int = 2**30) -> SceneIndexes:
     return SceneIndexes(store, ReferenceLibrary(store), DESCRIPTOR, EXTRACTOR, capacity_bytes)
 
 
-def test_who_does_not_wait_gets_those_described_in_the_background(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One that fails is described when it is asked for again."""
-    store.add_references(SCENE, [new(i, is_described=False) for i in range(3)])
-    library = ReferenceLibrary(store)
-    indexes, add = SceneIndexes(store, library, DESCRIPTOR, EXTRACTOR, 2**30), store.add_descriptor
-    left = [1]
-
-    def add_descriptor(key: str, name: str, vector: Any) -> None:
-        if left and left.pop():
-            raise OSError("the database is locked")
-        add(key, name, vector)
-
-    monkeypatch.setattr(store, "add_descriptor", add_descriptor)
-    for _ in range(2):
-        with pytest.raises(FeaturesMissing):
-            indexes.entries(SCENE, StageContext(), waits=False)
-        library._background.submit(lambda: None).result(timeout=30)  # all before it has ended
-    assert len(indexes.entries(SCENE, StageContext(), waits=False)) == 3
-    library.close()
+def test_who_does_not_wait_gets_what_any_server_has_described(store: Store) -> None:
+    records = store.add_references(SCENE, [new(i, is_described=False) for i in range(3)])
+    generation, other = store.get_generation(SCENE), indexes_of(store)
+    indexes = indexes_of(store)
+    assert len(indexes.entries(SCENE, StageContext(), waits=False).undescribed()) == 3
+    context = StageContext()
+    other.entries(SCENE, context, waits=False)
+    other.describe(SCENE, [(it.reference_id, it.key) for it in records[:2]], context)
+    assert indexes.entries(SCENE, StageContext(), waits=False).undescribed() == [("r2", records[2].key)]
+    assert context.lacking == {("retrieval", DESCRIPTOR.name, it.key): True for it in records[:2]}
+    late = StageContext(make_until_s=-math.inf)
+    indexes.describe(SCENE, [("r2", records[2].key)], late)
+    assert late.lacking == {("retrieval", DESCRIPTOR.name, records[2].key): False}
+    assert store.get_generation(SCENE) == generation, "descriptors are no change of the scene"
 
 
 class TestDamage:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Barrier
 from time import sleep
 
 import numpy as np
@@ -11,6 +12,7 @@ from support.scenes import CAMERA, make_scene, random_for
 
 from mapless.geometry import Camera
 from mapless_server.method.features.views import Features, Matches, View
+from mapless_server.serve import deferred
 from mapless_server.serve.deferred import DeferredExtractor, DeferredPairMatching
 
 VIEW = View(CAMERA, Features(np.zeros((0, 2), np.float32), np.zeros((0, 64), np.float32), np.zeros(0, np.float32)))
@@ -53,7 +55,7 @@ def test_weights_that_changed_since_the_start_are_named() -> None:
         DeferredExtractor("finds-2", Finds).made()
 
 
-def test_a_network_that_was_not_made_is_tried_again() -> None:
+def test_a_failure_is_remembered_for_a_time_then_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     failures = [OSError("no file")]
 
     def make() -> Pairs:
@@ -63,6 +65,27 @@ def test_a_network_that_was_not_made_is_tried_again() -> None:
 
     matching = DeferredPairMatching("pairs-1", make)
     scene = make_scene(random_for("deferred"))
-    with pytest.raises(OSError, match="no file"):
-        matching.match_one(scene.query, VIEW)
+    for _ in range(3):
+        with pytest.raises(RuntimeError, match="pairs-1 cannot be loaded: no file"):
+            matching.match_one(scene.query, VIEW)
+    monkeypatch.setattr(deferred, "FAILED_S", 0.0)
     assert matching.match_one(scene.query, VIEW).tolist() == [[len(scene.query.features), 0]]
+
+
+def test_threads_that_wait_for_a_failure_get_it_together() -> None:
+    begun, made = Barrier(4, timeout=20), list[str]()
+
+    def make() -> Finds:
+        made.append("once")
+        sleep(0.1)
+        raise OSError("no file")
+
+    def ask(extractor: DeferredExtractor) -> str:
+        begun.wait()
+        with pytest.raises(RuntimeError, match="no file") as failed:
+            extractor.made()
+        return str(failed.value)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(ask, [DeferredExtractor("finds-1", make)] * 4))) == 1
+    assert made == ["once"]

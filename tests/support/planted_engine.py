@@ -26,6 +26,7 @@ from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import Parts, engine_over
 from mapless_server.store import Store
+from support.described import describe_all
 from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5
@@ -93,6 +94,9 @@ class Setting:
 
     def describe(self, photos: Sequence[Photo]) -> list[Description]:
         return self.loop.run_until_complete(self.engine.describe(photos, caller()))
+
+    def describe_all(self, photos: Sequence[Photo]) -> list[Description]:
+        return describe_all(self.engine, photos)
 
     def close(self) -> None:
         self.loop.run_until_complete(self.engine.close())

@@ -196,18 +196,30 @@ class GetSceneRequest(_message.Message):
     def __init__(self, name: _Optional[str] = ...) -> None: ...
 
 class GetSceneResponse(_message.Message):
-    __slots__ = ("scene", "warnings", "contradiction", "compared_pair_count", "agreeing_pair_count")
+    __slots__ = ("scene", "warnings", "contradiction", "compared_pair_count", "agreeing_pair_count", "pending_work")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     WARNINGS_FIELD_NUMBER: _ClassVar[int]
     CONTRADICTION_FIELD_NUMBER: _ClassVar[int]
     COMPARED_PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
     AGREEING_PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
+    PENDING_WORK_FIELD_NUMBER: _ClassVar[int]
     scene: Scene
     warnings: _containers.RepeatedScalarFieldContainer[str]
     contradiction: str
     compared_pair_count: int
     agreeing_pair_count: int
-    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., contradiction: _Optional[str] = ..., compared_pair_count: _Optional[int] = ..., agreeing_pair_count: _Optional[int] = ...) -> None: ...
+    pending_work: _containers.RepeatedCompositeFieldContainer[PendingWork]
+    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., contradiction: _Optional[str] = ..., compared_pair_count: _Optional[int] = ..., agreeing_pair_count: _Optional[int] = ..., pending_work: _Optional[_Iterable[_Union[PendingWork, _Mapping]]] = ...) -> None: ...
+
+class PendingWork(_message.Message):
+    __slots__ = ("kind", "name", "reference_count")
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    kind: str
+    name: str
+    reference_count: int
+    def __init__(self, kind: _Optional[str] = ..., name: _Optional[str] = ..., reference_count: _Optional[int] = ...) -> None: ...
 
 class UpdateSceneRequest(_message.Message):
     __slots__ = ("scene", "update_mask")

@@ -33,7 +33,7 @@ from mapless_server.method.judge.hypothesis import Found, Hypothesis, Raster, Wh
 from mapless_server.method.promise import PROMISE
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Choice, Narrowing, Selection
-from mapless_server.scenes.library import Loaded, load_usable
+from mapless_server.scenes.library import FeaturesMissing, Loaded, load_usable
 from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
 from mapless_server.scheduling import Abandoned, Failure
 from mapless_server.store import SceneAttributes, SceneState
@@ -51,6 +51,9 @@ Decision: 025-choosing-references."""
 
 SAMPLED = 5
 """So many references show how most of a scene are held."""
+
+LEAST_DESCRIBED = 2
+"""An attempt is made with so many references at least where others still lack its features."""
 
 ALONE_BY_CHANCE = LEAST_AGREEMENT - PROMISE.agreement
 """Difference of the agreement of one reference and of two where both are as likely by chance."""
@@ -113,11 +116,20 @@ def _narrowing_of(search: Search) -> Narrowing:
 
 
 def load_chosen(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loaded:
-    """Loads chosen references without damaged ones; a damaged reference that the caller named is an error."""
+    """Loads chosen references without damaged ones, and without those whose features there is no time to make.
+
+    FeaturesMissing where too few are left. What is wrong with a reference that the caller named is an error.
+    """
     if search.query.reference_ids:
         return _load(search, reference_ids, tier)
     report = partial(search.source.report_damaged, search.query.scene_key)
-    return load_usable(lambda some: _load(search, some, tier), reference_ids, (DataLoss,), report)
+    try:
+        return load_usable(lambda some: _load(search, some, tier), reference_ids, (DataLoss,), report)
+    except FeaturesMissing as missing:
+        described = [it for it in reference_ids if it not in missing.reference_ids]
+        if len(described) < LEAST_DESCRIBED:
+            raise
+        return load_usable(lambda some: _load(search, some, tier), described, (DataLoss,), report)
 
 
 def attributes_of(search: Search, scene: SceneState) -> SceneAttributes:
@@ -318,9 +330,7 @@ def _shortlisted(search: Search, views: QueryViews, narrowing: Narrowing, tier: 
 
 def _load(search: Search, reference_ids: Sequence[str], tier: Tier) -> Loaded:
     """Loads references; SceneMadeAnew unless they are of the scene that the search's other references are of."""
-    # Only before a first result the features of references are waited for.
-    waits = not search.found
-    loaded = search.source.load(search.query.scene_key, reference_ids, tier.extractor, search.context, waits)
+    loaded = search.source.load(search.query.scene_key, reference_ids, tier.extractor, search.context)
     used = {it.scene.create_time_us for it in (search.material, *search.materials) if it is not None}
     if used - {loaded[0].create_time_us}:
         raise SceneMadeAnew

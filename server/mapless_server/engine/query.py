@@ -257,6 +257,23 @@ class LadderCut:
     unmatched: int = 0
 
 
+@dataclass(frozen=True)
+class MissingEvidence:
+    """What references lacked for the attempts at a photograph, since the background has not made it yet.
+
+    Attributes:
+        kind: "features", "retrieval" for vectors by which references are chosen, "matches" or "calibration".
+        name: the features, vectors, matches or answers.
+        reference_count: number of references that lacked it.
+        made_count: of these, those for which the call made it.
+    """
+
+    kind: str
+    name: str
+    reference_count: int
+    made_count: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The answer to a query, and the data that it was computed from.
@@ -274,6 +291,7 @@ class Result:
             features, references or rasters than the first ones begins with the extractor's name and a slash.
         attempts: the attempts that were made, in order.
         cuts: attempts that were left out, or not finished, for another reason than what the photograph shows.
+        missing: what references lacked for further attempts.
         camera: the camera that was chosen for a photograph without intrinsics; None if it came with some, or none was
             found.
     """
@@ -289,6 +307,7 @@ class Result:
     stage_seconds: dict[str, float] = field(default_factory=dict)
     attempts: tuple[Tried, ...] = ()
     cuts: tuple[LadderCut, ...] = ()
+    missing: tuple[MissingEvidence, ...] = ()
     camera: ChosenCamera | None = None
 
     @property

@@ -15,7 +15,9 @@ from mapless_server.method.structure.measured_depth import median_depth
 from mapless_server.scenes import Choice, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
 from mapless_server.scenes.indexes import SceneIndexes
-from mapless_server.scenes.retrieval.index import GlobalDescriptor
+from mapless_server.scenes.later import Pending
+from mapless_server.scenes.library import FeaturesMissing
+from mapless_server.scenes.retrieval.index import Entries, GlobalDescriptor
 from mapless_server.scenes.retrieval.ranking import nearest_references
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey
@@ -37,13 +39,15 @@ class Retrieval:
 
 
 class References:
-    """The references of all scenes: loaded, chosen, described, audited. Safe to use from several threads."""
+    """The references of all scenes: loaded, chosen, described, audited. Safe to use from several threads.
+
+    `pending` returns what the background has still to make in a scene; it is set where there is a background.
+    """
 
     def __init__(
         self,
         tools: SceneTools,
         retrievals: Sequence[Retrieval],
-        extractors: Sequence[FeatureExtractor],
         limits: ImageLimits,
         agreements: SceneAgreements,
     ) -> None:
@@ -51,15 +55,15 @@ class References:
 
         Raises ValueError unless the first descriptor is computed from the first extractor's features.
         """
-        descriptor = tools.descriptor
-        if descriptor.extractor not in (None, extractors[0].name):
-            raise ValueError(f"{descriptor.name} is made of {descriptor.extractor}, not of {extractors[0].name}")
+        descriptor, features = tools.descriptor, retrievals[0].extractor.name
+        if descriptor.extractor not in (None, features):
+            raise ValueError(f"{descriptor.name} is made of {descriptor.extractor}, not of {features}")
         self.load = tools.library.load
         self.report_damaged = tools.indexes.report_damaged
         self.agreements = agreements
+        self.pending: Callable[[SceneKey], Sequence[Pending]] = lambda _: ()
         self._tools = tools
-        self._retrievals = retrievals
-        self._extractors = extractors
+        self.retrievals = retrievals
         self._limits = limits
 
     def contradiction(self, scene_key: SceneKey) -> str:
@@ -76,13 +80,13 @@ class References:
     ) -> Choice:
         """Chooses references for a photograph by its global descriptor, or near a pose prior without reading it.
 
-        The descriptor is that of the extractor's features if they have one of their own; then FeaturesMissing if
-        references lack it, which are described in the background. NotFound if there is no such scene (field
-        "scene") or reference (field "references[i]"); DataLoss if a named reference is damaged (same field);
-        InvalidArgument if the image is bad.
+        The descriptor is that of the extractor's features if they have one of their own; references that still lack it
+        come last, and FeaturesMissing is raised where all do. NotFound if there is no such scene (field "scene") or
+        reference (field "references[i]"); DataLoss if a named reference is damaged (same field); InvalidArgument if
+        the image is bad.
         """
         # The scene comes first: a wrong name is found before the photograph is described.
-        main, own = self._retrievals[0], self._retrieval_of(extractor)
+        main, own = self.retrievals[0], self._retrieval_of(extractor)
         entries = main.indexes.entries(scene_key, context)
         if selection.near is not None:
             nearest = nearest_references(entries, selection.near, selection.count)
@@ -96,37 +100,58 @@ class References:
         if not len(entries):
             return Choice((), "", entries.generation)
         if own is not main:
-            entries = own.indexes.entries(scene_key, context, waits=False)
+            entries = self._described(scene_key, views, selection, context, own)
         view = views.view(own.extractor, context)
         with context.stage("retrieval"):
             vector = own.descriptor.describe(view)
             ranked = rank_references(entries, vector, selection)
         return Choice(tuple(ranked), own.descriptor.name, entries.generation)
 
+    def _described(
+        self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext, own: Retrieval
+    ) -> Entries:
+        """The references by a descriptor that is made in the background; those likely to be chosen are made now.
+
+        As long as the context has time for it. FeaturesMissing if no reference has it.
+        """
+        main, entries = self.retrievals[0], own.indexes.entries(scene_key, context, waits=False)
+        lacking = {key for _, key in entries.undescribed()}
+        if not lacking:
+            return entries
+        vector = main.descriptor.describe(views.view(main.extractor, context))
+        likely = rank_references(main.indexes.entries(scene_key, context), vector, selection)
+        own.indexes.describe(scene_key, [(it.reference_id, it.key) for it in likely if it.key in lacking], context)
+        entries = own.indexes.entries(scene_key, context, waits=False)
+        if len(left := entries.undescribed()) == len(entries):
+            raise FeaturesMissing([reference_id for reference_id, _ in left])
+        return entries
+
     def sample(self, scene_key: SceneKey, among: Sequence[str], count: int, context: StageContext) -> list[str]:
         """Ids of so many references at most, evenly spread: of the scene's, or of these that it has.
 
         NotFound if there is no such scene (field "scene").
         """
-        entries = self._retrievals[0].indexes.entries(scene_key, context)
+        entries = self.retrievals[0].indexes.entries(scene_key, context)
         rows = entries.rows(among or None)
         chosen = rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))]
         return [entries.reference(row)[0] for row in chosen.tolist()]
 
     def _retrieval_of(self, extractor: FeatureExtractor | None) -> Retrieval:
-        own = (it for it in self._retrievals if extractor is not None and it.extractor.name == extractor.name)
-        return next(own, self._retrievals[0])
+        own = (it for it in self.retrievals if extractor is not None and it.extractor.name == extractor.name)
+        return next(own, self.retrievals[0])
 
     def describe(self, photo: Photo, check: Callable[[], None]) -> Description:
-        """Computes all that the store keeps of a photograph, every tier's features.
+        """Computes what the first attempt of a query needs of a photograph: the first features and their descriptor.
 
-        InvalidArgument if it is bad, or its mask ignores all of it.
+        The rest is made in the background, or by the first query that needs it. InvalidArgument if the photograph is
+        bad, or its mask ignores all of it.
         """
         decoded, context = QueryViews(photo, self._limits), StageContext(check)
-        views = {it.name: decoded.view(it, context) for it in self._extractors}
-        vectors = {it.descriptor.name: it.descriptor.describe(views[it.extractor.name]) for it in self._retrievals}
+        first = self.retrievals[0]
+        view = decoded.view(first.extractor, context)
+        vectors = {first.descriptor.name: first.descriptor.describe(view)}
         # A batch is held in memory until it is stored, so without its pixels.
-        without_pixels = {name: replace(view, photograph=None) for name, view in views.items()}
+        without_pixels = {first.extractor.name: replace(view, photograph=None)}
         share = decoded.ignored_share(context)
         if share == 1:
             message = "the mask ignores the whole image: 0 means ignore, every other value use"
@@ -146,14 +171,14 @@ class References:
 
     def forget_scene(self, scene_key: SceneKey) -> None:
         """Frees the memory of a deleted scene."""
-        for it in self._retrievals:
+        for it in self.retrievals:
             it.indexes.forget(scene_key)
         self.agreements.forget_scene(scene_key)
 
     @property
     def index_bytes(self) -> int:
         """Memory of the retrieval indexes, bytes."""
-        return sum(it.indexes.size_bytes for it in self._retrievals)
+        return sum(it.indexes.size_bytes for it in self.retrievals)
 
     def close(self) -> None:
         """Ends the background work of the library and of the agreements."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -14,10 +15,11 @@ from mapless_server.method.judge.hypothesis import Attempt, Where, first_attempt
 from mapless_server.method.options import ChosenCamera, StageContext
 from mapless_server.method.rejection import PoseHypothesis
 from mapless_server.scenes import Choice
+from mapless_server.scenes.later import Pending
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
 from mapless_server.store import SceneAttributes, SceneState
 
-from .query import PREPARE, REFINE, CutReason, LadderCut, Query, Result, Tried
+from .query import PREPARE, REFINE, CutReason, LadderCut, MissingEvidence, Query, Result, Tried
 from .source import ReferenceSource
 
 if TYPE_CHECKING:  # services need not load what computes
@@ -95,6 +97,13 @@ UNFINISHED = "unfinished", "failed", "out_of_memory"
 """Outcomes of an attempt that did not come to an end."""
 
 
+LACKING_S = 2.7
+"""Longest time of a query in whose scene references lack what further attempts use: so its answer comes within 3 s."""
+
+MAKE_S = 1.5
+"""For so long since its begin, such a query makes what they lack. The rest is for attempts with it."""
+
+
 @dataclass(frozen=True, eq=False)
 class Search:
     """The state of a query between its stages.
@@ -116,8 +125,10 @@ class Search:
         cuts: attempts that were left out, or not finished, for another reason than what the photograph shows.
         is_cut_at: whether the caller gets cheap rungs only, though one follows that is not, of a name and features.
         verdict: what is answered by now; None before the first result.
+        begun_s: when the query came, by `time.monotonic`.
         start_s: when the attempt began to wait for the queue, by `time.monotonic`.
         give_up_s: time after which the verdict so far is the answer, if the attempt has no result by then.
+        pending: what the background has still to make in the scene; None before a doubt asks for it.
         listings: how often the scene was listed in the attempt.
         context: cancels and times the computation from the photograph and references of the attempt.
         spent_s: time of each stage of the computations before it.
@@ -146,8 +157,10 @@ class Search:
     cuts: tuple[LadderCut, ...] = ()
     is_cut_at: Callable[[str, str], bool] = lambda rung, features: False
     verdict: Verdict | None = None
+    begun_s: float = field(default_factory=time.monotonic)
     start_s: float = field(default_factory=time.monotonic)
     give_up_s: float = math.inf
+    pending: tuple[Pending, ...] | None = None
     listings: int = 1
     context: StageContext = field(default_factory=StageContext)
     spent_s: Mapping[str, float] = field(default_factory=dict)
@@ -207,9 +220,35 @@ class Search:
             stage_start_s=None,
             stage_processor_s=None,
             listings=1,
-            context=StageContext(self.context.check) if is_other else self.context,
+            context=self._next_context() if is_other else self.context,
             spent_s=self.seconds(features) if is_other else self.spent_s,
         )
+
+    def _next_context(self) -> StageContext:
+        """The context of an attempt with other photographs or references.
+
+        Before a first result, all is made that references lack; after it, as much as there is time for.
+        """
+        make_until_s = self.begun_s + MAKE_S if self.found else math.inf
+        return StageContext(self.context.check, make_until_s=make_until_s, lacking=self.context.lacking)
+
+    @property
+    def ends_s(self) -> float:
+        """Time by which it ends: its deadline, or earlier where references lack something for a further attempt."""
+        lacks = self.found and (self.context.lacking or self.pending)
+        return min(self.deadline_s, self.begun_s + LACKING_S) if lacks else self.deadline_s
+
+    @property
+    def missing(self) -> tuple[MissingEvidence, ...]:
+        """What references lacked for further attempts: what they were found to lack, then what waits in the scene."""
+        if not self.found:
+            return ()
+        waiting = {(it.work, it.name): it.reference_count for it in self.pending or ()}
+        lacking = dict(self.context.lacking)  # which a stage may change meanwhile
+        found = Counter((kind, name) for kind, name, _ in lacking)
+        made = Counter((kind, name) for (kind, name, _), is_made in lacking.items() if is_made)
+        names = dict.fromkeys([*found, *waiting])
+        return tuple(MissingEvidence(*it, max(found[it], waiting.get(it, 0)), made[it]) for it in names)
 
     def cut(self, rung: str, features: str, reason: CutReason, unmatched: int = 0) -> Search:
         """The search with another cut of the ladder."""

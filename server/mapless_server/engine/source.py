@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from mapless_server.method.features.extractors import FeatureExtractor
     from mapless_server.method.options import StageContext
     from mapless_server.scenes import Choice, Selection
+    from mapless_server.scenes.later import Pending
     from mapless_server.scenes.library import Loaded
     from mapless_server.security import SceneKey
 
@@ -24,7 +25,6 @@ class ReferenceSource(Protocol):
         reference_ids: Sequence[str],
         extractor: FeatureExtractor,
         context: StageContext,
-        waits: bool,
     ) -> Loaded:
         """Loads references of a scene, in the order given, with the scene as it was when they were read."""
         ...
@@ -42,6 +42,10 @@ class ReferenceSource(Protocol):
         extractor: FeatureExtractor | None = None,
     ) -> Choice:
         """Chooses references for a photograph, by what is made of this extractor's features if there is such."""
+        ...
+
+    def pending(self, scene_key: SceneKey) -> Sequence[Pending]:
+        """What the background has still to make in a scene."""
         ...
 
     def sample(self, scene_key: SceneKey, among: Sequence[str], count: int, context: StageContext) -> Sequence[str]:

@@ -280,7 +280,7 @@ class QueryStages:
         material = search.material
         if material is None or not material.unmatched:
             return False
-        until_s = min(search.give_up_s, search.deadline_s)
+        until_s = min(search.give_up_s, search.ends_s)
         until_s = search.start_s + REMATCH_SHARE * (until_s - search.start_s)
         return time.monotonic() + (self._verdicts.tier(search.attempt).pipeline.matcher.pair_s or 0.0) <= until_s
 
@@ -398,10 +398,12 @@ class QueryStages:
             return self._next(first, first.first_step)
         if not verdict.doubts:
             return self._done(search)
+        if search.pending is None:
+            search = replace(search, pending=tuple(search.source.pending(search.query.scene_key)))
         features = self._verdicts.tier(search.attempt).features
         before = search.before or search.attempt
         now_s = time.monotonic()
-        give_up_s = now_s + TIME_SHARE * (search.deadline_s - now_s)
+        give_up_s = min(now_s + TIME_SHARE * (search.deadline_s - now_s), search.ends_s)
         situation, doubts = situation_of(search, self._tiers, self._doubt.promise), verdict.doubts
         following = ladder.further(before, search.tried, doubts, situation)
         search, rungs = cutting.offered(search, following, lambda it: self._verdicts.tier(it).features)
@@ -417,7 +419,7 @@ class QueryStages:
         steps = tuple(replace(it, payload=it.payload.paused(search)) for it in steps)
         if search.verdict is None:
             return Next(steps)
-        fallback = Fallback(self._unfinished, search.give_up_s)
+        fallback = Fallback(self._unfinished, min(search.give_up_s, search.ends_s))
         return Next(steps, fallback, has_begun=search.stage_start_s is not None)
 
     def _done(self, search: Search) -> Done[Result]:

@@ -83,7 +83,7 @@ class Verdicts:
         ended = zip(search.attempts, search.tried, strict=True)
         attempts = tuple(replace(it, is_chosen=tried == chosen.attempt) for it, tried in ended)
         answer = _with_unfinished(result.answer, attempts)
-        return replace(result, answer=answer, attempts=attempts, cuts=search.cuts)
+        return replace(result, answer=answer, attempts=attempts, cuts=search.cuts, missing=search.missing)
 
     def without_present(self, search: Search, outcome: str, reason: CutReason) -> Result:
         """The result without the present attempt, which ended so; quickly, since the queue may wait for it."""

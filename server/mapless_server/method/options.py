@@ -3,6 +3,7 @@
 The options of each stage are in its module; `pipeline.StageOptions` combines them.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -116,10 +117,14 @@ class StageContext:
     Attributes:
         check: raises to cancel the computation.
         stage_seconds: time of each stage so far, in order; a stage that runs twice counts twice.
+        make_until_s: until when, by `time.monotonic`, what references lack is made.
+        lacking: what references were found to lack, see `lacks`.
     """
 
     check: Check = never_cancelled
     stage_seconds: dict[str, float] = field(default_factory=dict)
+    make_until_s: float = math.inf
+    lacking: dict[tuple[str, str, str], bool] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -134,3 +139,11 @@ class StageContext:
     def add(self, name: str, seconds: float) -> None:
         """Adds time that was measured elsewhere, such as that of a batch."""
         self.stage_seconds[name] = self.stage_seconds.get(name, 0.0) + seconds
+
+    def lacks(self, kind: str, name: str, reference_key: str, is_made: bool) -> None:
+        """Records that a reference lacked something that is made in the background, and whether it was made now."""
+        self.lacking[kind, name, reference_key] = is_made or self.lacking.get((kind, name, reference_key), False)
+
+    def makes(self, took_s: float = 0.0) -> bool:
+        """Whether there is time left to make what takes so long."""
+        return time.monotonic() + took_s <= self.make_until_s

@@ -1,16 +1,17 @@
-"""Matches references with one another when there is time, so that a query pays only for its own matches.
+"""Makes what references need besides their first features when there is time, so that a query need not.
 
-A thread takes one reference after another, of all scenes, and matches it with the references that a query from its
-place would choose, one pair at a time. The matches are stored where the queries of all servers find them. Between pairs
-it waits while the server computes for a caller, except for a small share of one core, so that it ends on a busy server,
-too.
+A thread takes one reference after another, of all scenes, finds its further features, and matches it with the
+references that a query from its place would choose, one pair at a time; `later.in_order` has the order. What it makes
+is stored where the queries of all servers find it, with which references are done, so that it goes on after a restart.
+Between steps it waits while the server computes for a caller, except for a small share of one core, so that it ends on
+a busy server, too.
 """
 
 import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -20,13 +21,15 @@ from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.features.matching import StoredPair
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
-from mapless_server.method.pairs.pair import in_order
+from mapless_server.method.pairs.pair import in_order as pair_in_order
+from mapless_server.security import SceneKey
 from mapless_server.store import Store
 from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress, delete_unused, record_use
 
 from .calibration.calibrator import SceneCalibrations
 from .depth.scene_depths import SceneDepths
 from .indexes import SceneIndexes
+from .later import LaterFeatures, Pending, Work, in_order, name_of, what_of
 from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
 from .retrieval.ranking import rank_beside
@@ -83,12 +86,14 @@ class SceneWork:
     Attributes:
         calibrations: made when all references are matched; they use depths.
         depths: made before scenes are calibrated.
+        features: further features of references.
         agreements: brought up to date after a scene's references are matched.
     """
 
     calibrations: SceneCalibrations | None = None
     depths: SceneDepths | None = None
     agreements: SceneAgreements | None = None
+    features: Sequence[LaterFeatures] = ()
 
 
 class BackgroundMatching:
@@ -120,9 +125,12 @@ class BackgroundMatching:
         self._depths = work.depths
         self._agreements = work.agreements
         self.options = options or BackgroundOptions()
-        self._progress = {matching.name: Progress() for matching in matchings}
+        self._urgent, others = in_order(list(matchings), work.features)
+        self._all = [*self._urgent, *others]
+        self._progress = {it.name: Progress() for it in self._all}
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
+        self._makes_pairs = False
         self._step_begin_s = 0.0
         self._busy_s = -math.inf
         self._use_is_due_s = -math.inf
@@ -137,6 +145,7 @@ class BackgroundMatching:
         if self._store.database.only_reads:
             log.warning("references are not matched in the background: the store can only be read")
             return
+        self._makes_pairs = makes_pairs
         run = partial(self._run, self._match_and_calibrate if makes_pairs else self.maintain)
         self._thread = threading.Thread(target=run, name="background matching", daemon=True)
         self._thread.start()
@@ -155,10 +164,11 @@ class BackgroundMatching:
             self._depths.abandon()
 
     def _match_and_calibrate(self) -> None:
-        """Makes waiting depths, then calibrates waiting scenes; before each, new references are matched."""
-        self.match_waiting()
-        while self._make_next_depth() or self._calibrate_next():
-            self.match_waiting()
+        """Does what waits: what is urgent of new references, then depths, then calibrations, then the rest."""
+        has_more = True
+        while has_more and not self._closing.is_set():
+            self._work_on(self._urgent)
+            has_more = self._make_next_depth() or self._calibrate_next() or self._work_on(self._all, is_rest=True)
 
     def _make_next_depth(self) -> bool:
         self._step_begin_s = time.monotonic()
@@ -169,22 +179,44 @@ class BackgroundMatching:
         return self._calibrations is not None and self._calibrations.calibrate_next(self._wait_for_callers)
 
     def match_waiting(self) -> None:
-        """Matches the references that may be claimed now, until none is left; raises if the store fails."""
+        """Does all work on references that may be claimed now, until none is left; raises if the store fails."""
+        self._work_on(self._all)
+
+    def _work_on(self, works: Sequence[Work], is_rest: bool = False) -> bool:
+        """Does work on the references that may be claimed now, in order, until none is left.
+
+        With `is_rest` it returns after work that is urgent, with True, so that what follows that comes first.
+        """
         self._step_begin_s = time.monotonic()
-        found = self._claim()
+        found = self._claim(works)
         if found is None:
-            if self._waiting_count:  # another server may have matched them
+            if self._waiting_count:  # another server may have done it
                 self._count_waiting()
-            return
+            return False
         self._count_waiting()
         # Of its own, so that references that queries use stay in memory.
-        with closing(ReferenceLibrary(self._store.uncached(_CACHE_BYTES))) as library:
+        uncached = self._store.uncached(_CACHE_BYTES)
+        with closing(ReferenceLibrary(uncached, locks=self._indexes.locks)) as library:
             while found is not None and not self._closing.is_set():
-                self._match_claimed(library, *found)
+                self._work_on_claimed(library, *found)
+                if is_rest and found[0] in self._urgent:
+                    return True
                 if time.monotonic() - self._counted_s >= _WAITING_IS_COUNTED_S:
                     self._count_waiting()
-                found = self._claim()
+                found = self._claim(works)
         self._count_waiting()
+        return False
+
+    def pending(self, scene_key: SceneKey) -> list[Pending]:
+        """The work that is left in a scene, in order; empty if nothing is done in the background."""
+        if self._thread is None or not self._makes_pairs:
+            return []
+        counts = self._pairs.count_complete(scene_key, self._progress)
+        total = counts[""]
+        left = [Pending(what_of(it), name_of(it), total - counts[it.name]) for it in self._all]
+        if self._calibrations is not None and self._calibrations.is_waiting(scene_key):
+            left.append(Pending("calibration", self._calibrations.kind, total))
+        return [it for it in left if it.reference_count > 0]
 
     def maintain(self) -> None:
         """Deletes damaged pairs and those of unused matchings, at most once an hour."""
@@ -196,7 +228,7 @@ class BackgroundMatching:
             self._depths.maintain()
         if time.monotonic() < self._use_is_due_s:
             return
-        used = [matching.name for matching in self._matchings]
+        used = list(self._progress)
         if self._calibrations is not None:
             self._calibrations.maintain()
             used.append(self._calibrations.kind)
@@ -221,44 +253,54 @@ class BackgroundMatching:
                 self._observer.count("background_failures")
                 log.warning("matching references in the background failed, and is tried again: %s", error)
 
-    def _claim(self) -> tuple[TierMatching, Claim] | None:
+    def _claim(self, works: Sequence[Work]) -> tuple[Work, Claim] | None:
         self.maintain()
-        for matching in self._matchings:
-            claim = self._pairs.claim(matching.name, self._progress[matching.name])
+        for work in works:
+            claim = self._pairs.claim(work.name, self._progress[work.name])
             if claim is not None:
-                return matching, claim
+                return work, claim
         return None
 
     def _count_waiting(self) -> None:
-        self._waiting_count = max(self._pairs.count_waiting(it.name) for it in self._matchings)
+        self._waiting_count = max(map(self._pairs.count_waiting, self._progress))
         self._observer.waiting("background_waiting", self._waiting_count)
         self._counted_s = time.monotonic()
 
-    def _match_claimed(self, library: ReferenceLibrary, matching: TierMatching, claim: Claim) -> None:
-        """Matches one reference, or postpones it if that fails."""
+    def _work_on_claimed(self, library: ReferenceLibrary, work: Work, claim: Claim) -> None:
+        """Does work on one reference, or postpones it if that fails."""
         until_s = time.monotonic() + CLAIM_S / 3
         begin_s = time.thread_time()
         try:
-            made, is_complete = self._match(library, matching, claim, until_s)
+            made, is_complete = self._make(library, work, claim, until_s)
         except Closed:
             made, is_complete = {}, False
         except NotFound:  # the reference was deleted
-            self._pairs.postpone(matching.name, claim)
+            self._pairs.postpone(work.name, claim)
             return
         except Exception as error:
-            wait_s = self._pairs.postpone(matching.name, claim)
+            wait_s = self._pairs.postpone(work.name, claim)
             self._observer.count("background_failures")
-            message = "reference %s of scene %s could not be matched, next time in %.0f s: %s"
+            message = "reference %s of scene %s could not be described or matched, next time in %.0f s: %s"
             is_expected = isinstance(error, DataLoss)
             log.warning(
                 message, claim.reference_id, claim.scene_key, wait_s, error, exc_info=None if is_expected else error
             )
             return
-        self._pairs.add(matching.name, claim, made, is_complete)
+        self._pairs.add(work.name, claim, made, is_complete)
         if self._agreements is not None and any(it.error_px is not None for it in made.values()):
             self._agreements.touch(claim.scene_key)
         self._observer.count("background_pairs", len(made))
         self._observer.count("background_cpu_seconds", time.thread_time() - begin_s)
+
+    def _make(
+        self, library: ReferenceLibrary, work: Work, claim: Claim, until_s: float
+    ) -> tuple[dict[Pair, StoredPair], bool]:
+        """Finds a reference's features, or matches it, see `_match`."""
+        if not isinstance(work, LaterFeatures):
+            return self._match(library, work, claim, until_s)
+        self._let_callers_first()
+        work.make(library, claim, StageContext(self._check))
+        return {}, True
 
     def _match(
         self, library: ReferenceLibrary, matching: TierMatching, claim: Claim, until_s: float
@@ -285,7 +327,7 @@ class BackgroundMatching:
                     library, claim.scene_key, [reference_id], matching.extractor, context
                 ):
                     self._let_callers_first()
-                    made |= self._match_pair(matching, *in_order(subject, other))
+                    made |= self._match_pair(matching, *pair_in_order(subject, other))
             except Closed:
                 return made, False
         return made, True

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Sequence
-from functools import partial
 
 from mapless_server.cache import LruCache
 from mapless_server.errors import DataLoss, NotFound, RequestError
@@ -15,7 +15,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
 
-from .library import FeaturesMissing, Loaded, ReferenceLibrary, load_usable
+from .library import KeyedLocks, Loaded, ReferenceLibrary, load_usable
 from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 
 log = logging.getLogger(__name__)
@@ -49,27 +49,56 @@ class SceneIndexes:
         """Memory of all indexes, bytes."""
         return self._cached.used
 
+    @property
+    def locks(self) -> KeyedLocks:
+        """Locks of what is being computed of references, see `ReferenceLibrary`."""
+        return self._library.locks
+
     def entries(self, scene_key: SceneKey, context: StageContext, waits: bool = True) -> Entries:
         """Returns the references of a scene as it is now.
 
         References without a descriptor are described now, one by one, and finished ones are kept if the context is
-        cancelled; if `waits` is False they are described in the background, and FeaturesMissing is raised. A reference
-        that cannot be described because it is damaged remains without a descriptor. NotFound if there is no such scene
-        (field "scene"); Abandoned if the context is cancelled.
+        cancelled; if `waits` is False they remain without. So does one that cannot be described because it is damaged.
+        NotFound if there is no such scene (field "scene"); Abandoned if the context is cancelled.
         """
         # Even if the scene is evicted meanwhile, this call continues with the same index.
         cached = self._get(scene_key)
-        entries = self._refresh(scene_key, cached)
-        while undescribed := cached.describable(entries):
+        while True:
+            self._refresh(scene_key, cached)
+            undescribed = self._undescribed(cached)
+            if not undescribed or not waits:
+                return cached.index.entries()
             log.info("describing %d references of scene %s for retrieval", len(undescribed), scene_key)
-            if not waits:
-                self._describe_later(scene_key, cached, undescribed)
-                raise FeaturesMissing
             with context.stage("describe"):
                 for reference_id, key in undescribed:
                     self._describe(scene_key, cached, reference_id, key, context)
-            entries = self._refresh(scene_key, cached)
-        return entries
+
+    def describe(self, scene_key: SceneKey, references: Sequence[tuple[str, str]], context: StageContext) -> None:
+        """Describes those of these references, ids and keys, that have no descriptor, while the context has time.
+
+        What is described, and what is left, is recorded in the context.
+        """
+        cached, took_s = self._get(scene_key), 0.0
+        lacking = {key for _, key in cached.describable(cached.index.entries())}
+        for reference_id, key in references:
+            if key in lacking:
+                is_made, begin_s = context.makes(took_s), time.monotonic()
+                if is_made:
+                    with context.stage("describe"):
+                        self._describe(scene_key, cached, reference_id, key, context)
+                context.lacks("retrieval", self._descriptor.name, key, is_made)
+                took_s = time.monotonic() - begin_s if is_made else took_s
+
+    def _undescribed(self, cached: _CachedIndex) -> list[tuple[str, str]]:
+        """Id and key of the entries without a descriptor, after those that were stored meanwhile have been read."""
+        undescribed = cached.describable(cached.index.entries())
+        if not undescribed:
+            return []
+        stored = self._store.load_descriptors([key for _, key in undescribed], self._descriptor.name)
+        if stored:
+            with cached.updating:
+                cached.index.describe(stored)
+        return [it for it in undescribed if it[1] not in stored]
 
     def forget(self, scene_key: SceneKey) -> None:
         """Frees the index of a deleted scene."""
@@ -117,24 +146,21 @@ class SceneIndexes:
 
         return load_usable(load, reference_ids, (DataLoss, NotFound), report)[1]
 
-    def _describe_later(
-        self, scene_key: SceneKey, cached: _CachedIndex, undescribed: Sequence[tuple[str, str]]
+    def describe_stored(
+        self, library: ReferenceLibrary, scene_key: SceneKey, reference_id: str, key: str, context: StageContext
     ) -> None:
-        """Describes references in the background, one by one."""
-        for reference_id, key in undescribed:
-            if key not in cached.scheduled:
-                cached.scheduled.add(key)
-                describe = partial(self._describe_scheduled, scene_key, cached, reference_id, key)
-                self._library.later(scene_key, reference_id, describe)
-
-    def _describe_scheduled(self, scene_key: SceneKey, cached: _CachedIndex, reference_id: str, key: str) -> None:
-        try:
-            self._describe(scene_key, cached, reference_id, key, StageContext())
-        finally:  # if that failed for a reason that passes, the next query schedules it again
-            cached.scheduled.discard(key)
+        """Stores a reference's descriptor unless it has one; the library loads its features."""
+        if not self._store.load_descriptors([key], self._descriptor.name):
+            self._describe(scene_key, self._get(scene_key), reference_id, key, context, library)
 
     def _describe(
-        self, scene_key: SceneKey, cached: _CachedIndex, reference_id: str, key: str, context: StageContext
+        self,
+        scene_key: SceneKey,
+        cached: _CachedIndex,
+        reference_id: str,
+        key: str,
+        context: StageContext,
+        library: ReferenceLibrary | None = None,
     ) -> None:
         """Computes and stores a reference's descriptor, unless the reference has been deleted."""
         context.check()
@@ -145,7 +171,7 @@ class SceneIndexes:
                 return
             try:
                 untimed = StageContext(context.check)
-                _, (reference,) = self._library.load(scene_key, (reference_id,), self._extractor, untimed)
+                _, (reference,) = (library or self._library).load(scene_key, (reference_id,), self._extractor, untimed)
                 if reference.key != key:  # it was replaced by another one with the same id
                     return
                 vector = self._descriptor.describe(reference.view)
@@ -186,8 +212,7 @@ class _CachedIndex:
     """An index, and the lock `updating` of the thread that updates it.
 
     `damaged_ids` are of references that are not in the index, of which some may have been deleted; `undescribable` are
-    keys of references found damaged when they were to be described; those `scheduled` are described in the background;
-    of `reported_ids` the damage has been logged.
+    keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged.
     """
 
     def __init__(self, index: SceneIndex) -> None:
@@ -195,7 +220,6 @@ class _CachedIndex:
         self.damaged_ids: set[str] = set()
         self.undescribable: set[str] = set()
         self.reported_ids: set[str] = set()
-        self.scheduled: set[str] = set()
         self.updating = threading.Lock()
 
     def describable(self, entries: Entries) -> list[tuple[str, str]]:

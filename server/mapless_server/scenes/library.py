@@ -1,12 +1,13 @@
 """Stored references as the pipeline needs them: with the requested features, and with photographs that load lazily.
 
-Features are computed once, when a reference is added. If a store lacks the features of a new extractor, the first calls
-that need them compute them from the stored photographs, and store them.
+The first features are computed when a reference is added, the others in the background. A call that needs what a
+reference lacks computes it from the stored photograph, and stores it.
 """
 
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -34,6 +35,7 @@ from .stored import DepthFinder
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.05
+_LONGEST_WAIT_S = 5.0
 _REMEMBERED_EXIFS = 20_000
 """Number of references whose EXIF is kept in memory, half a KB each."""
 
@@ -42,7 +44,11 @@ Loaded = tuple[SceneState, tuple[PosedView, ...]]
 
 
 class FeaturesMissing(Exception):
-    """References lack the requested features, and the caller does not wait for them."""
+    """References lack the requested features, and the caller has no time to make them; with their ids."""
+
+    def __init__(self, reference_ids: Collection[str] = ()) -> None:
+        super().__init__(f"{len(reference_ids)} references have no such features yet")
+        self.reference_ids = frozenset(reference_ids)
 
 
 class Closed(Exception):
@@ -81,15 +87,18 @@ class KeyedLocks:
 class ReferenceLibrary:
     """Loads references from the store; thread-safe.
 
-    `locks` are of what threads are computing, by the reference's key and the name of the extractor or descriptor.
+    Attributes:
+        locks: of what threads are computing, by the reference's key and the name of the extractor or descriptor.
+        is_idle: whether the server computes nothing for a caller; what is described in the background waits for it.
     """
 
-    def __init__(self, store: Store, depths: DepthFinder | None = None) -> None:
-        """`depths` adds stored depths to references; None adds none."""
+    def __init__(self, store: Store, depths: DepthFinder | None = None, locks: KeyedLocks | None = None) -> None:
+        """`depths` adds stored depths to references; None adds none. The locks may be those of another library."""
         self._store = store
         self._depths = depths
         self._measured = MeasuredDepths(store)
-        self.locks = KeyedLocks()
+        self.locks = locks or KeyedLocks()
+        self.is_idle: Callable[[], bool] = lambda: True
         self._exifs: LruCache[Exif] = LruCache(_REMEMBERED_EXIFS)
         self._background = ThreadPoolExecutor(1, "describe")
         self._scheduled: set[tuple[str, str]] = set()
@@ -107,15 +116,14 @@ class ReferenceLibrary:
         reference_ids: Sequence[str],
         extractor: FeatureExtractor,
         context: StageContext,
-        waits: bool = True,
     ) -> Loaded:
         """Loads references of a scene, in the order given, with the scene as it was when they were read.
 
-        References without features of the extractor are described now, one by one, and finished ones are kept if the
-        context is cancelled; if `waits` is False, they are described in the background. Photographs are read when their
-        pixels are first used. FeaturesMissing if references lack features and `waits` is False; NotFound if there is no
-        such scene (field "scene") or reference (field "references[i]"); Abandoned if the context is cancelled; DataLoss
-        if stored data of one of them are damaged.
+        References without features of the extractor are described now, one by one, as long as the context has time for
+        it, and finished ones are kept if it is cancelled; the others are described in the background, and
+        FeaturesMissing is raised. Photographs are read when their pixels are first used. NotFound if there is no such
+        scene (field "scene") or reference (field "references[i]"); Abandoned if the context is cancelled; DataLoss if
+        stored data of one of them are damaged.
         """
         while True:
             snapshot = self._store.load_references(scene_key, reference_ids, extractor.name)
@@ -124,12 +132,12 @@ class ReferenceLibrary:
                 if self._depths is not None:
                     views = self._depths.with_depths(views, extractor.name)
                 return snapshot.scene, self._with_measured_depths(snapshot, views, extractor.name)
-            if not waits:
-                self._describe_later(snapshot.undescribed, extractor)
-                raise FeaturesMissing
             _log_describing(snapshot.undescribed, extractor)
             with context.stage("describe"):
-                self._describe_all(snapshot.undescribed, extractor, context.check)
+                left = self._describe_all(snapshot.undescribed, extractor, context)
+            if left:
+                self._describe_later(left, extractor)
+                raise FeaturesMissing([it.reference_id for it in left])
 
     def _with_measured_depths(
         self, snapshot: SceneSnapshot, views: tuple[PosedView, ...], extractor: str
@@ -156,7 +164,8 @@ class ReferenceLibrary:
     def _describe_scheduled(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
         """Describes one reference; one that is damaged is not tried again, one that the store did not take now is."""
         try:
-            self._describe_all([record], extractor, lambda: None)
+            self._wait_for_callers()
+            self._describe_all([record], extractor, StageContext())
         except Unavailable:
             with self._scheduling:
                 self._scheduled.discard((record.key, extractor.name))
@@ -166,28 +175,49 @@ class ReferenceLibrary:
         """Describes a reference in the background, after what is to be described already."""
         self._background.submit(self._in_background, scene_key, reference_id, describe)
 
+    def _wait_for_callers(self) -> None:
+        """Waits until the server computes nothing for callers, but not for long, so that it goes on if it is busy."""
+        until_s = time.monotonic() + _LONGEST_WAIT_S
+        while not self.is_idle() and time.monotonic() < until_s:
+            if self._closing.wait(_POLL_S):
+                raise Closed
+
     def _in_background(self, scene_key: SceneKey, reference_id: str, describe: Callable[[], None]) -> None:
         if self._closing.is_set():
             return
         try:
             describe()
+        except Closed:
+            pass
         except Exception as error:  # a damaged or deleted reference must not keep the others from being described
             log.warning("reference %s of scene %s is not described: %s", reference_id, scene_key, error)
 
     def _describe_all(
-        self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor, check: Callable[[], None]
-    ) -> None:
-        """Describes references; waits for those that other threads are describing, whether they succeed or not."""
+        self, records: Sequence[ReferenceRecord], extractor: FeatureExtractor, context: StageContext
+    ) -> Sequence[ReferenceRecord]:
+        """Describes references as long as there is time; returns those that are left.
+
+        Waits for those that other threads are describing, whether they succeed or not.
+        """
         elsewhere: list[ReferenceRecord] = []
-        for record in records:
-            check()
+        took_s = 0.0
+        for i, record in enumerate(records):
+            context.check()
+            if not context.makes(took_s):
+                for left in records[i:]:
+                    context.lacks("features", extractor.name, left.key, is_made=False)
+                return records[i:]
+            begin_s = time.monotonic()
             with self.locks.try_lock((record.key, extractor.name)) as is_mine:
                 if is_mine:
                     self._describe(record, extractor)
+                    context.lacks("features", extractor.name, record.key, is_made=True)
                 else:
                     elsewhere.append(record)
+            took_s = time.monotonic() - begin_s
         for record in elsewhere:
-            self.locks.wait((record.key, extractor.name), check)
+            self.locks.wait((record.key, extractor.name), context.check)
+        return ()
 
     def _describe(self, record: ReferenceRecord, extractor: FeatureExtractor) -> None:
         # Another thread may have finished between reading the store and taking the lock.

@@ -27,6 +27,7 @@ from mapless_server.scenes.calibration.calibrator import Calibrator, SceneCalibr
 from mapless_server.scenes.depth.scene_depths import DepthMaker, SceneDepths
 from mapless_server.scenes.depth_checks import DepthChecks
 from mapless_server.scenes.indexes import SceneIndexes
+from mapless_server.scenes.later import LaterFeatures
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.retrieval.index import GlobalDescriptor
@@ -113,8 +114,7 @@ def engine_over(store: Store, tiers: Sequence[Tier], options: EngineOptions, par
     parts = parts or Parts()
     observed, depth_network = parts.background_observer, parts.depth_network
     check_tiers(tiers)
-    extractors = [tier.extractor for tier in tiers]
-    first = extractors[0]
+    first = tiers[0].extractor
     descriptor = parts.descriptor or VladDescriptor.of(first)
     depths = None
     if depth_network is not None or any(tier.uses_depths for tier in tiers):
@@ -138,13 +138,16 @@ def engine_over(store: Store, tiers: Sequence[Tier], options: EngineOptions, par
     checks = DepthChecks(store, indexes, library, *compared)
     agreements = SceneAgreements(store, indexes, library, *compared, observed, checks)
     tools = SceneTools(library, indexes, descriptor, first, pairs, checks)
-    references = References(tools, retrievals, extractors, options.image_limits, agreements)
+    references = References(tools, retrievals, options.image_limits, agreements)
     engine = QueueEngine(tiers, references, options, parts.observer, parts.quota, parts.method)
     maker = None
     if depth_network is not None:
         maker = DepthMaker(indexes, first, tiers[0].pipeline.matcher, depth_network)
     made = None if depths is None else SceneDepths(store, depths, maker, observed)
-    engine.background = _background_matching(store, indexes, engine, observed, made, depths, agreements)
+    library.is_idle = lambda: engine.queue.job_count == 0
+    indexes_of = {it.extractor.name: it.indexes for it in retrievals[1:]}
+    features = [LaterFeatures(it.extractor, indexes_of.get(it.extractor.name)) for it in tiers[1:]]
+    engine.background = _background_matching(store, indexes, engine, observed, made, depths, agreements, features)
     return engine
 
 
@@ -156,6 +159,7 @@ def _background_matching(
     made: SceneDepths | None,
     depths: DepthFinder | None,
     agreements: SceneAgreements,
+    features: Sequence[LaterFeatures],
 ) -> BackgroundMatching:
     """Makes the matching for the queries of each tier, in order; queries look for its results from then on."""
     pairs = PairStore(store.database)
@@ -169,7 +173,7 @@ def _background_matching(
     first = engine.tiers[0]
     # Answers of stronger tiers, some per cent, keep the generic radii: their references take too long to localize.
     calibrator = Calibrator(indexes, first.extractor, first.pipeline, first.kind)
-    return BackgroundMatching(
+    background = BackgroundMatching(
         store,
         indexes,
         finders | strong,
@@ -179,8 +183,11 @@ def _background_matching(
             SceneCalibrations(store, calibrator, observer, depths if first.uses_depths else None, agreements),
             made,
             agreements,
+            features,
         ),
     )
+    engine.references.pending = background.pending
+    return background
 
 
 def make_depth_network(settings: Settings, tiers: Sequence[Tier]) -> Reconstructor | None:

@@ -132,7 +132,6 @@ class _RenderedReferences:
         reference_ids: Sequence[str],
         extractor: FeatureExtractor,
         context: StageContext,
-        waits: bool,
     ) -> Loaded:
         """See ReferenceSource."""
         return SceneState(1, 0, SceneAttributes), tuple(self._view(extractor, i) for i in range(len(_CENTRES_X_M)))
@@ -146,6 +145,10 @@ class _RenderedReferences:
     def contradiction(self, scene_key: SceneKey) -> str:
         """See ReferenceSource."""
         return ""
+
+    def pending(self, scene_key: SceneKey) -> tuple[()]:
+        """See ReferenceSource."""
+        return ()
 
     def choose(self, *_: object) -> Choice:
         """See ReferenceSource."""

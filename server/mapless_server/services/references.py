@@ -107,6 +107,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         key = scene_key_from_name(request.name, "name", call.principal.tenant)
         scene = await self._stored(self._store.get_scene, key)
         agreement = await self._agreement(key)
+        pending = await self._stored(self._engine().references.pending, key)
         warnings = dict.fromkeys(agreement.warnings(scene.attributes.arbitrary_unit))
         if not agreement.contradicts_itself:  # else what its references say of lenses is of no use
             warnings |= await self._stored(self._lens_warnings, key)
@@ -116,6 +117,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             contradiction=agreement.contradiction,
             compared_pair_count=agreement.pair_count,
             agreeing_pair_count=agreement.agreeing_count,
+            pending_work=[
+                pb.PendingWork(kind=it.work, name=it.name, reference_count=it.reference_count) for it in pending
+            ],
         )
 
     async def _agreement(self, key: SceneKey) -> Agreement:

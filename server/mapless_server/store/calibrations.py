@@ -119,6 +119,12 @@ def count_waiting(database: Database, kind: str) -> int:
         return connection.scalar(select(func.count()).select_from(changed)) or 0
 
 
+def is_waiting(database: Database, scene_key: SceneKey, kind: str) -> bool:
+    """Whether a scene has changed since its calibration."""
+    with database.read() as connection:
+        return connection.scalar(_select_changed(kind).where(scene.c.scene_id == scene_key)) is not None
+
+
 def _select_changed(kind: str) -> Select[Any]:
     """Scenes with references that have changed since their calibration."""
     column, generation = scene_calibration.c, scene_generation.c

@@ -206,6 +206,24 @@ class PairStore:
                 again = update(reference_matching).where(of_them, progress.due_time_us.is_(None))
                 connection.execute(again.values(due_time_us=rows.now_us()))
 
+    def count_complete(self, scene_key: SceneKey, matchings: Collection[str]) -> dict[str, int]:
+        """Numbers of references of a scene whose pairs are all stored, by matching; and of all of them, by "".
+
+        Those whose pairs could not be made, which are tried again after a while, count as if they were.
+        """
+        column = reference_matching.c
+        complete: Select[Any] = (
+            select(column.matching, func.count())
+            .join(reference, reference.c.key == column.reference_key)
+            .where(reference.c.scene_id == scene_key, column.matching.in_(matchings))
+            .where(or_(column.due_time_us.is_(None), column.failure_count > 0))
+            .group_by(column.matching)
+        )
+        of_scene = select(func.count()).select_from(reference).where(reference.c.scene_id == scene_key)
+        with self._database.read() as connection:
+            counts = {row[0]: row[1] for row in connection.execute(complete)}
+            return {name: counts.get(name, 0) for name in matchings} | {"": connection.scalar(of_scene) or 0}
+
     def count_waiting(self, matching: str) -> int:
         """Number of references whose pairs are not all stored."""
         column = reference_matching.c

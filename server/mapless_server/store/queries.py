@@ -192,6 +192,16 @@ def features_by_key(connection: Connection, keys: Sequence[str], extractor: str)
     return found
 
 
+def descriptors_by_key(connection: Connection, keys: Sequence[str], name: str) -> dict[str, Row[Any]]:
+    """Rows of `global_descriptor` with this name, by the keys of their references."""
+    column, found = global_descriptor.c, dict[str, Row[Any]]()
+    for portion in _portions(keys):
+        is_wanted = column.reference_key.in_(portion) & (column.name == name)
+        stored: Select[Any] = select(column.reference_key, column.data, column.sha256).where(is_wanted)
+        found |= {row.reference_key: row for row in connection.execute(stored)}
+    return found
+
+
 def find_by_key(connection: Connection, key: str, *columns: ColumnElement[Any]) -> Row[Any]:
     """Columns of the reference with this key; raises NotFound if it was deleted."""
     return _one(connection, select(*columns).where(_exists(key)), _reference_deleted)

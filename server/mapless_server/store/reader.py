@@ -7,6 +7,8 @@ from functools import partial, wraps
 from types import MappingProxyType
 from typing import Any, Concatenate, NamedTuple, NoReturn, ParamSpec, Protocol, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, Select, Table, select
 
 from mapless.depth import DepthImage
@@ -334,6 +336,15 @@ class StoreReader:
             tuple(described[key] for key in wanted if key in described),
             tuple(rows.reference_record(undescribed[key]) for key in lacking),
         )
+
+    @observed
+    def load_descriptors(self, keys: Sequence[str], name: str) -> dict[str, NDArray[np.float32]]:
+        """Loads the global descriptors (D,) that these references have under a name, undamaged ones, by their keys."""
+        with self.database.read() as connection:
+            found = unless_damaged(
+                connection, partial(queries.descriptors_by_key, connection, keys, name), dict[str, Row[Any]]
+            )
+        return rows.descriptors(found, name)
 
     @observed
     def list_changes(self, scene_key: SceneKey, since_generation: int | None, descriptor_name: str) -> SceneChanges:

@@ -4,6 +4,7 @@ import hashlib
 import time
 import uuid
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from typing import Any
@@ -185,6 +186,16 @@ def features_owner(key: str, extractor: str) -> str:
 def descriptor_owner(key: str, name: str) -> str:
     """Owner of a global descriptor, for `codec.sha256_for`."""
     return f"{key}#{name}"
+
+
+def descriptors(found: Mapping[str, Row[Any]], name: str) -> dict[str, NDArray[np.float32]]:
+    """Reads rows of `queries.descriptors_by_key`; damaged ones are left out."""
+    intact = dict[str, bytes]()
+    for key, row in found.items():
+        with suppress(codec.Damaged):
+            codec.check(descriptor_owner(key, name), row.data, row.sha256, "global descriptor")
+            intact[key] = row.data
+    return dict(zip(intact, codec.decode_descriptors(list(intact.values())), strict=True))
 
 
 def indexed_references(found: Sequence[Row[Any]], descriptor_name: str) -> tuple[list[IndexedReference], list[str]]:

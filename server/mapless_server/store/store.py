@@ -248,26 +248,15 @@ class Store(StoreReader):
 
     @observed
     def add_descriptor(self, key: str, name: str, vector: NDArray[np.float32]) -> None:
-        """Stores a global descriptor (D,) that a reference lacks, and keeps an existing one; a change of its scene.
+        """Stores a global descriptor (D,) that a reference lacks, and keeps an existing one.
 
-        `list_changes` then lists the reference among those added. NotFound if the reference was deleted; ValueError if
-        the descriptor is not a vector, or a number is not finite as float16.
+        It is not a change of the scene, see SceneRecord: `load_descriptors` finds it. NotFound if the reference was
+        deleted; ValueError if the descriptor is not a vector, or a number is not finite as float16.
         """
         row = rows.descriptor_row(key, name, vector)
-        reference = tables.reference
-        with self.database.read() as connection:
-            scene_key = SceneKey(queries.find_by_key(connection, key, reference.c.scene_id).scene_id)
-            column = tables.global_descriptor.c
-            if (
-                connection.scalar(select(column.name).where(column.reference_key == key, column.name == name))
-                is not None
-            ):
-                return
         with self.changing() as connection:
-            generation = queries.begin_change(connection, scene_key)
             queries.lock_reference(connection, key)
-            if queries.insert_new(connection, tables.global_descriptor, row):
-                connection.execute(update(reference).where(reference.c.key == key).values(generation=generation))
+            queries.insert_new(connection, tables.global_descriptor, row)
 
     @observed
     def delete_reference(self, scene_key: SceneKey, reference_id: str) -> str:

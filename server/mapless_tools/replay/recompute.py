@@ -129,7 +129,6 @@ class RecordedSource:
         reference_ids: Sequence[str],
         extractor: FeatureExtractor,
         context: StageContext,
-        waits: bool,
     ) -> Loaded:
         """Implements ReferenceSource with the captured references; others could not be read then either."""
         for index, reference_id in enumerate(reference_ids):
@@ -137,6 +136,10 @@ class RecordedSource:
                 raise DataLoss(f"reference {reference_id!r} was not captured", field=f"references[{index}]")
         scene = SceneState(self.part.generation, 0, lambda: self.call.attributes)
         return scene, self.references.load(scene_key, reference_ids, extractor)
+
+    def pending(self, scene_key: SceneKey) -> tuple[()]:
+        """Implements ReferenceSource: what was missing then is in the cuts."""
+        return ()
 
     def contradiction(self, scene_key: SceneKey) -> str:
         """Implements ReferenceSource: it is captured with the attributes."""

@@ -30,6 +30,7 @@ from mapless_server.store.calibrations import (
     claim_scene,
     count_waiting,
     discard_damaged,
+    is_waiting,
     list_newest,
     postpone,
     release,
@@ -235,6 +236,10 @@ class SceneCalibrations:
     def kind(self) -> str:
         """Kind of the answers that it calibrates."""
         return self._calibrator.kind
+
+    def is_waiting(self, scene_key: SceneKey) -> bool:
+        """Whether a scene has changed since its calibration."""
+        return is_waiting(self._store.database, scene_key, self.kind)
 
     def calibrate_next(self, pause: Callable[[], None]) -> bool:
         """Calibrates one scene that may be claimed now; returns False if there is none. Raises if the store fails.

@@ -212,6 +212,9 @@ def diagnostics_to_message(result: Result, query: Query) -> pb.Diagnostics:
         message.ladder_cuts.add(
             rung=cut.rung, features=cut.features, reason=reason, unmatched_reference_count=unmatched
         )
+    for lack in result.missing:
+        counts = {"reference_count": lack.reference_count, "made_reference_count": lack.made_count}
+        message.missing_evidence.add(kind=lack.kind, name=lack.name, **counts)
     return message
 
 
