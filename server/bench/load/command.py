@@ -100,10 +100,16 @@ def neighbours_command(
     _finish(_neighbours(data, elsewhere, quick, output, **given))
 
 
+@load_app.command("refusals")
+def refusals_command(quick: Quick = False, output: Output = OUTPUT) -> None:
+    """Measures the processor time of refusing a call, beside a bare grpc.aio server."""
+    _finish(_refusals(quick, output))
+
+
 @load_app.command("all")
 def all_command(data: Data = None, minutes: Minutes = 10.0, quick: Quick = False, output: Output = OUTPUT) -> None:
-    """All three, one after the other."""
-    checks = [*_overhead(quick, output), *_pipeline(data, quick, output)]
+    """All of these but `neighbours`, one after the other."""
+    checks = [*_overhead(quick, output), *_refusals(quick, output), *_pipeline(data, quick, output)]
     _finish(checks + _soak(data, quick, output, minutes=minutes))
 
 
@@ -116,6 +122,18 @@ def _overhead(quick: bool, output: Path) -> list[Check]:
         subjects = measure_overhead(options, progress)
     checks, lines = overhead_checks(subjects), overhead_lines(subjects, options)
     report_part(output / OUTPUT_FILE, "overhead", lines, checks, overhead_figures(subjects, options))
+    return checks
+
+
+def _refusals(quick: bool, output: Path) -> list[Check]:
+    from .refusals import RefusalOptions, measure_refusals, refusal_checks, refusal_lines
+    from .report import report_part
+
+    options = RefusalOptions(calls=20, rounds=1) if quick else RefusalOptions()
+    with _measuring() as progress:
+        found = measure_refusals(options, progress)
+    checks = refusal_checks(found)
+    report_part(output / OUTPUT_FILE, "refusals", refusal_lines(found, options), checks, {"refusals": found})
     return checks
 
 
