@@ -112,6 +112,8 @@ def test_onnx_runtime_computes_the_same(
     )
     np.testing.assert_allclose(our_describe(keypoints), describe(keypoints), atol=1e-3, rtol=1e-4)
     assert our_describe(keypoints[:0]).shape == (0, 64)
+    ours.release_memory()
+    np.testing.assert_array_equal(ours.maps(grey)[0], our_logits)
 
 
 @pytest.mark.skipif(not kernel.is_available(), reason="not compiled, or no AVX2")

@@ -123,6 +123,9 @@ class TorchEdgePoint2:
         self._device = torch.device(device)
         self._network = fuse(network.eval()).to(self._device)
 
+    def release_memory(self) -> None:
+        """Nothing: torch keeps none on a CPU, and what it keeps of a GPU is for all networks."""
+
     def maps(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float32], Describe]:
         """Logits (H, W) of a grey image (H, W), and what returns descriptors at keypoints; see `Describe`."""
         with torch.inference_mode():

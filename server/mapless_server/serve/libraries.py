@@ -30,6 +30,12 @@ def configure_libraries(settings: Settings) -> None:
         _share_one_heap()
 
 
+def trim_heap() -> None:
+    """Gives the heap's free memory back to the system, if the C library is glibc: the next query requests it again."""
+    if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(0)
+
+
 def _share_one_heap() -> None:
     """Makes all threads allocate from the same heap, if the C library is glibc.
 

@@ -263,6 +263,9 @@ async def _start(
     services.starts("it localizes its first photograph")
     await _warm_up(settings, engine, metrics)
     await services.open(engine)
+    from .idle import release_when_idle  # what it imports is loaded by now
+
+    _run_task(stack, release_when_idle(engine.tiers, QUIET_S))
     if settings.warm_up:
         from .warm_up import warm_up_stronger
 

@@ -25,9 +25,12 @@ from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions, StageContext
 from mapless_server.scenes import Choice, Narrowing
 from mapless_server.scenes.library import Loaded
-from mapless_server.scheduling import Flow, WorkQueue
+from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.store import SceneAttributes, SceneState
+
+from .deferred import Deferred
+from .idle import until_idle
 
 log = logging.getLogger(__name__)
 
@@ -37,8 +40,6 @@ the usual time of a query."""
 
 MAX_ERROR_M = 0.1
 """The scene is easy: a larger error means a failure."""
-
-_LOOKS = 50
 
 _LIMIT_S = 600.0  # networks may be compiled by the first photograph
 _CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
@@ -89,21 +90,13 @@ async def warm_up(engine: QueueEngine) -> None:
 async def warm_up_stronger(engine: QueueEngine, quiet_s: float) -> None:
     """Uses the features of the later tiers once, when nothing was computed for `quiet_s`; raises what makes them fail.
 
-    They answer only where the first tier is in doubt. Loading torch takes as long as the whole start, and makes what is
-    computed beside it as much slower. A query that is in doubt before loads them itself, and its deadline bounds that.
+    They answer only where the first tier is in doubt. Those that are deferred are left out: torch takes 340 MB, and as
+    long to load as the whole start. The first photograph or work in the background that needs them loads them.
     """
     for tier in engine.tiers[1:]:
-        await _until_idle(engine.queue, quiet_s)
-        await _time_pair(tier)
-
-
-async def _until_idle(queue: WorkQueue, quiet_s: float) -> None:
-    """Returns when the queue has computed nothing for so long."""
-    busy_s, since_s = queue.busy_s, time.monotonic()
-    while time.monotonic() - since_s < quiet_s:
-        await asyncio.sleep(quiet_s / _LOOKS)
-        if queue.job_count or queue.busy_s > busy_s:
-            busy_s, since_s = queue.busy_s, time.monotonic()
+        await until_idle(engine.queue, quiet_s)
+        if not isinstance(tier.extractor, Deferred):
+            await _time_pair(tier)
 
 
 async def _time_pair(tier: Tier) -> None:

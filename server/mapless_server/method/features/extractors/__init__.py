@@ -19,6 +19,7 @@ from .sift import SiftExtractor, SiftOptions
 __all__ = [
     "FEATURES",
     "FeatureExtractor",
+    "KeepsMemory",
     "Mirrors",
     "SiftExtractor",
     "SiftOptions",
@@ -39,6 +40,15 @@ class FeatureExtractor(Protocol):
 
         The camera has the same size; `ignored` are pixels, at any size, near which no feature is found, see `masks`.
         """
+        ...
+
+
+@runtime_checkable
+class KeepsMemory(Protocol):
+    """Keeps memory for the next photograph."""
+
+    def release_memory(self) -> None:
+        """Gives it back; the next photograph gets it again. Thread-safe."""
         ...
 
 

@@ -38,6 +38,10 @@ class EdgePoint2Network(Protocol):
         """Logits (H, W) of a grey image (H, W), and what returns descriptors at keypoints."""
         ...
 
+    def release_memory(self) -> None:
+        """Gives back the memory that is kept for the next image."""
+        ...
+
 
 class EdgePoint2Extractor:
     """EdgePoint2 "s64", "m64", "l64" or "e64". Scores are in 0 to 1; the authors' threshold is 0.0067, a logit of -5.
@@ -70,6 +74,10 @@ class EdgePoint2Extractor:
             described / np.maximum(np.linalg.norm(described, axis=1, keepdims=True), np.float32(1e-12)),
             SIZE_OF_WIDTH / np.sqrt(-curvatures.max(axis=1)),
         )
+
+    def release_memory(self) -> None:
+        """See KeepsMemory."""
+        self._network.release_memory()
 
 
 def _network(variant: str, weights: Path, device: str) -> EdgePoint2Network:
