@@ -29,6 +29,13 @@ enum { POSE = 6, MOST_INTRINSICS = 4, MOST_ROWS = POSE + MOST_INTRINSICS, LANES 
 
 typedef Py_ssize_t Index;
 
+/* Eight doubles, by whatever vectors the processor has. */
+typedef double Eight __attribute__((vector_size(LANES * sizeof(double))));
+#define ALWAYS static inline __attribute__((always_inline))
+
+
+ALWAYS void load(Eight *to, const double *from) { memcpy(to, from, sizeof(*to)); }
+
 /* Observations by view, and the same grouped by point: those of point p are order[start[p]] to order[start[p + 1]]. */
 typedef struct {
     const Index *end, *point, *view; /* end (V): where the observations of each view end */
@@ -95,62 +102,92 @@ typedef struct {
     double *pose_block, *pose_gradient, *point_block, *point_gradient;
 } Equations;
 
+/* Sums of one view: rows of its block of the matrix, and its gradient. */
+typedef struct {
+    Eight block[MOST_ROWS][2], gradient[2];
+} ViewSums;
+
+/* Adds an observation: residual, weight, derivatives a by the point, j (2, 16) by the unknowns of its view, of which
+ * `rows` are used, in `parts` of eight. */
+ALWAYS void add_observation(const double residual[2], double w, double least_curvature, double a[2][3],
+                            double j[2][MOST_LANES], int rows, int parts, ViewSums *sums, double cross[3][MOST_LANES]) {
+    double r0 = residual[0], r1 = residual[1];
+    Eight x[2], y[2], wx[2], wy[2];
+    for (int p = 0; p < parts; p++) load(&x[p], j[0] + p * LANES), load(&y[p], j[1] + p * LANES);
+    if (least_curvature < 1) {
+        const double squared = r0 * r0 + r1 * r1, shrink = sqrt(1 - 4 * (1 - least_curvature) * w * (1 - w));
+        const double share = (1 - shrink) / (squared > 1e-12 ? squared : 1e-12), s0 = share * r0, s1 = share * r1;
+        for (int k = 0; k < 3; k++) {
+            const double along = s0 * a[0][k] + s1 * a[1][k];
+            a[0][k] -= r0 * along, a[1][k] -= r1 * along;
+        }
+        for (int p = 0; p < parts; p++) {
+            const Eight along = s0 * x[p] + s1 * y[p];
+            x[p] -= r0 * along, y[p] -= r1 * along;
+        }
+        r0 /= shrink, r1 /= shrink;
+    }
+    double weighted[2][MOST_LANES];
+    for (int p = 0; p < parts; p++) {
+        wx[p] = w * x[p], wy[p] = w * y[p];
+        sums->gradient[p] += wx[p] * r0 + wy[p] * r1;
+        for (int m = 0; m < 3; m++) {
+            const Eight its = wx[p] * a[0][m] + wy[p] * a[1][m];
+            memcpy(cross[m] + p * LANES, &its, sizeof(its));
+        }
+        memcpy(weighted[0] + p * LANES, &wx[p], sizeof(wx[p])), memcpy(weighted[1] + p * LANES, &wy[p], sizeof(wy[p]));
+    }
+    for (int k = 0; k < rows; k++)
+        for (int p = 0; p < parts; p++) sums->block[k][p] += weighted[0][k] * x[p] + weighted[1][k] * y[p];
+}
+
+/* Adds C and h of an observation to those of its point; see add_observation. */
+ALWAYS void add_to_point(double *c, double *h, Index count, const double a[2][3], const double residual[2], double w,
+                         double shrink) {
+    const double r0 = residual[0] / shrink, r1 = residual[1] / shrink;
+    static const int first[6] = {0, 1, 2, 0, 0, 1}, second[6] = {0, 1, 2, 1, 2, 2};
+    for (int k = 0; k < 6; k++)
+        c[k * count] += w * (a[0][first[k]] * a[0][second[k]] + a[1][first[k]] * a[1][second[k]]);
+    for (int k = 0; k < 3; k++) h[k * count] += w * (a[0][k] * r0 + a[1][k] * r1);
+}
+
 /* Adds the equations of all observations, for the loss's weights (O,); see ViewColumns.equations. */
-WIDE static void add_equations(const Seen *seen, const double *residual, const double *by_point, const double *by_pose,
-                          const double *by_intrinsics, const double *weights, double least_curvature,
-                          const Equations *to) {
+WIDE static void add_equations(const Seen *seen, const double *residuals, const double *by_point, const double *by_pose,
+                               const double *by_intrinsics, const double *weights, double least_curvature,
+                               const Equations *to) {
     const Index n = seen->observations, first = first_of_query(seen), of_query = n - first, count = seen->points;
-    const Index width = POSE * seen->views + seen->intrinsics;
+    const Index width = POSE * seen->views + seen->intrinsics, intrinsics = seen->intrinsics;
     for (Index v = 0, o = 0; v < seen->views; v++) {
-        const int rows = rows_of(seen, v), lanes = (int)lanes_of(seen, v);
-        double block[MOST_ROWS][MOST_LANES] = {{0}}, gradient[MOST_ROWS] = {0};
+        const int rows = rows_of(seen, v);
+        ViewSums sums = {0};
         for (; o < seen->end[v]; o++) {
-            double x[3 + MOST_LANES] = {0}, y[3 + MOST_LANES] = {0}, r0 = residual[o], r1 = residual[n + o];
-            const double w = weights[o];
-            for (int k = 0; k < 3; k++) x[k] = by_point[k * n + o], y[k] = by_point[(3 + k) * n + o];
-            for (int k = 0; k < POSE; k++) x[3 + k] = by_pose[k * n + o], y[3 + k] = by_pose[(POSE + k) * n + o];
-            for (int k = POSE; k < rows; k++) {
-                x[3 + k] = by_intrinsics[(k - POSE) * of_query + o - first];
-                y[3 + k] = by_intrinsics[(k - POSE + seen->intrinsics) * of_query + o - first];
+            double a[2][3], j[2][MOST_LANES] = {{0}}, cross[3][MOST_LANES];
+            const double residual[2] = {residuals[o], residuals[n + o]}, w = weights[o];
+            for (int i = 0; i < 2; i++) {
+                for (int k = 0; k < 3; k++) a[i][k] = by_point[(3 * i + k) * n + o];
+                for (int k = 0; k < POSE; k++) j[i][k] = by_pose[(POSE * i + k) * n + o];
             }
-            if (least_curvature < 1) {
-                const double squared = r0 * r0 + r1 * r1, shrink = sqrt(1 - 4 * (1 - least_curvature) * w * (1 - w));
-                const double share = (1 - shrink) / (squared > 1e-12 ? squared : 1e-12);
-                for (int k = 0; k < 3 + rows; k++) {
-                    const double along = share * (r0 * x[k] + r1 * y[k]);
-                    x[k] -= r0 * along, y[k] -= r1 * along;
-                }
-                r0 /= shrink, r1 /= shrink;
+            if (rows == POSE) {
+                add_observation(residual, w, least_curvature, a, j, POSE, 1, &sums, cross);
+            } else {
+                for (int i = 0; i < 2; i++)
+                    for (Index k = 0; k < intrinsics; k++)
+                        j[i][POSE + k] = by_intrinsics[(intrinsics * i + k) * of_query + o - first];
+                add_observation(residual, w, least_curvature, a, j, rows, 2, &sums, cross);
             }
-            const double *a = x, *b = y, *j = x + 3, *l = y + 3;
-            const Index p = seen->point[o];
-            double *c = to->point_block + p, *h = to->point_gradient + p;
-            c[0] += w * (a[0] * a[0] + b[0] * b[0]);
-            c[count] += w * (a[1] * a[1] + b[1] * b[1]);
-            c[2 * count] += w * (a[2] * a[2] + b[2] * b[2]);
-            c[3 * count] += w * (a[0] * a[1] + b[0] * b[1]);
-            c[4 * count] += w * (a[0] * a[2] + b[0] * b[2]);
-            c[5 * count] += w * (a[1] * a[2] + b[1] * b[2]);
-            for (int k = 0; k < 3; k++) h[k * count] += w * (a[k] * r0 + b[k] * r1);
-            for (int k = 0; k < rows; k++) {
-                const double wj = w * j[k], wl = w * l[k];
-                gradient[k] += wj * r0 + wl * r1;
-                for (int first_lane = 0; first_lane < lanes; first_lane += LANES)
-                    for (int m = first_lane; m < first_lane + LANES; m++) block[k][m] += wj * j[m] + wl * l[m];
-            }
+            const double shrink = least_curvature < 1 ? sqrt(1 - 4 * (1 - least_curvature) * w * (1 - w)) : 1;
+            add_to_point(to->point_block + seen->point[o], to->point_gradient + seen->point[o], count, a, residual, w,
+                         shrink);
             for (int m = 0; m < 3; m++) {
-                const double wa = w * a[m], wb = w * b[m];
-                double *e = to->cross + (o * 3 + m) * POSE;
-                for (int k = 0; k < POSE; k++) e[k] = wa * j[k] + wb * l[k];
-                if (rows == POSE) continue;
-                e = to->cross_of_intrinsics + ((o - first) * 3 + m) * seen->intrinsics - POSE;
-                for (int k = POSE; k < rows; k++) e[k] = wa * j[k] + wb * l[k];
+                memcpy(to->cross + (o * 3 + m) * POSE, cross[m], POSE * sizeof(double));
+                if (rows > POSE)
+                    memcpy(to->cross_of_intrinsics + ((o - first) * 3 + m) * intrinsics, cross[m] + POSE,
+                           (size_t)intrinsics * sizeof(double));
             }
         }
-        for (int k = 0; k < rows; k++) {
-            to->pose_gradient[POSE * v + k] = gradient[k];
-            memcpy(to->pose_block + (POSE * v + k) * width + POSE * v, block[k], (size_t)rows * sizeof(double));
-        }
+        memcpy(to->pose_gradient + POSE * v, sums.gradient, (size_t)rows * sizeof(double));
+        for (int k = 0; k < rows; k++)
+            memcpy(to->pose_block + (POSE * v + k) * width + POSE * v, sums.block[k], (size_t)rows * sizeof(double));
     }
 }
 
@@ -214,10 +251,11 @@ static inline void gather(const Seen *seen, Index p, const double *cross, const 
         for (int m = 0; m < 3; m++) {
             double *its = to->column[m] + row;
             memcpy(its, cross + (o * 3 + m) * POSE, POSE * sizeof(double));
-            memset(its + POSE, 0, (size_t)(lanes - POSE) * sizeof(double));
-            if (lanes > LANES)
-                memcpy(its + POSE, cross_of_intrinsics + ((o - first) * 3 + m) * intrinsics,
-                       (size_t)intrinsics * sizeof(double));
+            its[POSE] = its[POSE + 1] = 0;
+            if (lanes == LANES) continue;
+            memset(its + LANES, 0, LANES * sizeof(double));
+            memcpy(its + POSE, cross_of_intrinsics + ((o - first) * 3 + m) * intrinsics,
+                   (size_t)intrinsics * sizeof(double));
         }
         row += lanes;
     }
@@ -252,18 +290,12 @@ static inline void scatter(const Seen *seen, Index p, const PointRows *from, dou
         for (int m = 0; m < 3; m++) {
             const double *its = from->column[m] + from->begin[b];
             memcpy(cross + (o * 3 + m) * POSE, its, POSE * sizeof(double));
-            if (from->view[b] == seen->views - 1)
+            if (from->view[b] == seen->views - 1 && intrinsics)
                 memcpy(cross_of_intrinsics + ((o - first) * 3 + m) * intrinsics, its + POSE,
                        (size_t)intrinsics * sizeof(double));
         }
     }
 }
-
-/* Eight doubles, by whatever vectors the processor has. */
-typedef double Eight __attribute__((vector_size(LANES * sizeof(double))));
-#define ALWAYS static inline __attribute__((always_inline))
-
-ALWAYS void load(Eight *to, const double *from) { memcpy(to, from, sizeof(*to)); }
 
 /* Subtracts from 8 columns of so many rows, at least 6, the products of columns a with rows b of 8. */
 ALWAYS void subtract(double *to, Index wide, Index rows, const double *const a[3], Index i, const double *const b[3],
@@ -316,20 +348,28 @@ WIDE static void eliminate(const Seen *seen, double damping, const double *point
 
 /* Steps (P, 3) of the points for a motion (U,) of the cameras. */
 WIDE static void step_points(const Seen *seen, const double *factor, const double *gradient, const double *cross,
-                        const double *cross_of_intrinsics, const double *motion, PointRows *rows, double *steps) {
-    const Index count = seen->points;
+                             const double *cross_of_intrinsics, const double *motion, double *steps) {
+    const Index count = seen->points, n = seen->observations, first = first_of_query(seen);
+    for (Index p = 0; p < count; p++)
+        for (int k = 0; k < 3; k++) steps[3 * p + k] = gradient[k * count + p];
+    for (Index o = 0; o < n; o++) {
+        double *s = steps + 3 * seen->point[o];
+        const double *of_view = motion + POSE * seen->view[o];
+        for (int m = 0; m < 3; m++) {
+            const double *e = cross + (o * 3 + m) * POSE;
+            s[m] += ((e[0] * of_view[0] + e[1] * of_view[1]) + (e[2] * of_view[2] + e[3] * of_view[3])) +
+                    (e[4] * of_view[4] + e[5] * of_view[5]);
+            if (o < first) continue;
+            const double *i = cross_of_intrinsics + ((o - first) * 3 + m) * seen->intrinsics;
+            for (Index k = 0; k < seen->intrinsics; k++) s[m] += i[k] * of_view[POSE + k];
+        }
+    }
     for (Index p = 0; p < count; p++) {
-        double l[6], b[3], *s = steps + 3 * p;
-        gather(seen, p, cross, cross_of_intrinsics, rows);
+        double l[6], *s = steps + 3 * p;
         for (int k = 0; k < 6; k++) l[k] = factor[k * count + p];
-        for (int k = 0; k < 3; k++) b[k] = gradient[k * count + p];
-        for (Index c = 0; c < rows->blocks; c++)
-            for (Index i = 0; i < rows_of(seen, rows->view[c]); i++)
-                for (int k = 0; k < 3; k++)
-                    b[k] += rows->column[k][rows->begin[c] + i] * motion[POSE * rows->view[c] + i];
-        s[2] = -b[2] / l[2];
-        s[1] = (-b[1] - l[5] * s[2]) / l[1];
-        s[0] = (-b[0] - l[3] * s[1] - l[4] * s[2]) / l[0];
+        s[2] = -s[2] / l[2];
+        s[1] = (-s[1] - l[5] * s[2]) / l[1];
+        s[0] = (-s[0] - l[3] * s[1] - l[4] * s[2]) / l[0];
     }
 }
 
@@ -587,24 +627,20 @@ static PyObject *eliminate_call(PyObject *Py_UNUSED(module), PyObject *arguments
 static PyObject *step_call(PyObject *Py_UNUSED(module), PyObject *arguments) {
     Arrays a;
     Seen seen;
-    PointRows rows;
     if (!begin(arguments, 2, 9, 8, &a, &seen)) return NULL;
     const Index n = seen.observations, of_query = n - first_of_query(&seen), i = seen.intrinsics, p = seen.points;
     const Index lengths[] = {6 * p, 3 * p, 18 * n, 3 * i * of_query, POSE * seen.views + i, 3 * p};
     const int fits = have_lengths(&a, 3, lengths);
-    void *room = NULL;
-    double *padded = fits ? make_room(&seen, 0, &rows, &room) : NULL;
-    if (padded) {
+    if (fits) {
         Py_BEGIN_ALLOW_THREADS
-        step_points(&seen, doubles(&a, 3), doubles(&a, 4), doubles(&a, 5), doubles(&a, 6), doubles(&a, 7), &rows,
+        step_points(&seen, doubles(&a, 3), doubles(&a, 4), doubles(&a, 5), doubles(&a, 6), doubles(&a, 7),
                     doubles(&a, 8));
         Py_END_ALLOW_THREADS
     }
     free(seen.start);
     if (!fits) return sizes_do_not_fit(&a);
     release(&a);
-    free(room);
-    return room ? Py_NewRef(Py_None) : PyErr_NoMemory();
+    Py_RETURN_NONE;
 }
 
 static PyObject *leave_out_call(PyObject *Py_UNUSED(module), PyObject *arguments) {
