@@ -7,13 +7,14 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections import deque
+from collections.abc import AsyncGenerator, Callable, Coroutine, Iterator
 from contextlib import suppress
 from types import TracebackType
 from typing import Any, TypeVar
 
 from .calls import health, localization, references
-from .connection import Connection
+from .connection import IN_FLIGHT, Connection, ItemT
 from .errors import MaplessError
 from .options import ConnectOptions
 
@@ -82,6 +83,26 @@ class Client(Connection):
     async def unblocked(self, function: Callable[..., T], *arguments: Any) -> T:
         """Calls a function in another thread."""
         return await asyncio.to_thread(function, *arguments)
+
+    async def pipelined(
+        self, call: Callable[[ItemT], Coroutine[Any, Any, T]], items: Iterator[ItemT]
+    ) -> AsyncGenerator[T, None]:
+        """Implements Connection.pipelined with tasks. One that is cancelled cancels the calls that run."""
+        running = deque[asyncio.Task[T]]()
+        try:
+            while (item := await self.unblocked(next, items, None)) is not None:
+                if len(running) == IN_FLIGHT:
+                    yield await running.popleft()
+                running.append(asyncio.create_task(call(item)))
+            while running:
+                yield await running.popleft()
+        except MaplessError:
+            await asyncio.gather(*running, return_exceptions=True)
+            raise
+        finally:
+            for task in running:
+                task.cancel()
+            await asyncio.gather(*running, return_exceptions=True)
 
     async def _pause(self, duration_s: float, error: MaplessError) -> None:
         with suppress(asyncio.TimeoutError):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Generator, Iterator
+from collections import deque
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Generator, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import wraps
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from .calls import health, localization, references
-from .connection import Connection
+from .connection import IN_FLIGHT, Connection, ItemT
 from .errors import MaplessError
 from .options import ConnectOptions
 
@@ -113,6 +115,29 @@ class Client(Connection):
     retrieve_references = _blocking(references.retrieve_references)
     audit_scene = _iterated(references.audit_scene)
     check_coverage = _blocking(references.check_coverage)
+
+    async def pipelined(
+        self, call: Callable[[ItemT], Coroutine[Any, Any, T]], items: Iterator[ItemT]
+    ) -> AsyncGenerator[T, None]:
+        """Implements Connection.pipelined with threads. One that is interrupted leaves the calls that run to end."""
+        running, threads = deque[Future[T]](), ThreadPoolExecutor(IN_FLIGHT, "upload")
+
+        def finished(item: ItemT) -> T:
+            result: T = _finished(call(item))
+            return result
+
+        try:
+            for item in items:
+                if len(running) == IN_FLIGHT:
+                    yield running.popleft().result()
+                running.append(threads.submit(finished, item))
+            while running:
+                yield running.popleft().result()
+        except Exception:
+            threads.shutdown(cancel_futures=True)
+            raise
+        finally:
+            threads.shutdown(wait=False, cancel_futures=True)
 
     async def _pause(self, duration_s: float, error: MaplessError) -> None:
         if self._closed.wait(duration_s):

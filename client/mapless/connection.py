@@ -15,7 +15,16 @@ import math
 import random
 import time
 import warnings
-from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterable,
+    AsyncIterator,
+    Awaitable,
+    Callable,
+    Coroutine,
+    Iterable,
+    Iterator,
+)
 from contextlib import aclosing, contextmanager
 from copy import copy
 from dataclasses import replace
@@ -41,6 +50,7 @@ _FIELDS = ("scene", "name", "scene_id")
 """Fields of requests that contain it: the scene's name, the name of a scene or reference, or the id of a new scene."""
 
 T = TypeVar("T")
+ItemT = TypeVar("ItemT")
 C = TypeVar("C", bound="Connection")
 
 MALFORMED_ANSWER = "MALFORMED_ANSWER"
@@ -50,6 +60,9 @@ _JITTER = 0.2  # relative, of our own pauses, as in gRPC
 _LOST = frozenset({"UNAVAILABLE", "CANCELLED"})
 """Codes of a lost server or connection. The client does not wait for calls that it cancels, so CANCELLED comes from a
 load balancer, or a server that stops, in the middle of the answer."""
+IN_FLIGHT = 2
+"""Messages of an upload at a time: one is computed while the next is read and sent."""
+
 _FEW_ATTEMPTS = 4
 """After so many, in about 1.4 s, it is examined why no connection is made; what is wrong with certificates or protocol,
 and the answer of a health check, are not waited for any longer."""
@@ -272,6 +285,15 @@ class Connection:
     async def unblocked(self, function: Callable[..., T], *arguments: Any) -> T:
         """Calls a function that may wait for a file or the network: asyncio's client in another thread."""
         return function(*arguments)
+
+    def pipelined(
+        self, call: Callable[[ItemT], Coroutine[Any, Any, T]], items: Iterator[ItemT]
+    ) -> AsyncGenerator[T, None]:
+        """Yields the result of a call for each item, in order; `IN_FLIGHT` calls run at a time.
+
+        Items are read while calls run. The error of a call is raised in its turn, after those that run have ended.
+        """
+        raise NotImplementedError
 
     async def _pause(self, duration_s: float, error: MaplessError) -> None:
         """Waits before the next attempt; if there is none, the call ends with `error`."""

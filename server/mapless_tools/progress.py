@@ -1,15 +1,29 @@
 """The progress of a command, on standard error: a bar on a terminal, lines in a log."""
 
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    ProgressColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.progress import Progress as Bars
+from rich.text import Text
 
 T = TypeVar("T")
+
+LEAST_RATED_S = 0.5
+"""A line of a log says how much is done a second only after so long."""
 
 LINES = 10
 """Lines of a step in a log, after that of its beginning."""
@@ -28,6 +42,7 @@ def progress_bars() -> Iterator[Progress]:
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
+        _RateColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
@@ -55,13 +70,28 @@ def labelled(progress: Progress, label: str) -> Progress:
     return lambda step, done, total: progress(f"{label}: {step}", done, total)
 
 
+class _RateColumn(ProgressColumn):
+    """How much of a step is done a second."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else _rate(speed))
+
+
+def _rate(per_s: float) -> str:
+    return f"{per_s:.1f} a second"
+
+
 def _lines() -> Progress:
     printed: dict[str, int] = {}
+    begun_s: dict[str, float] = {}
 
     def progress(step: str, done: int, total: int) -> None:
+        took_s = time.monotonic() - begun_s.setdefault(step, time.monotonic())
         part = done * LINES // total if total else LINES
         if part > printed.get(step, -1):
-            print(step if total == 1 else f"{step}: {done} of {total}", file=sys.stderr, flush=True)
+            rate = f", {_rate(done / took_s)}" if took_s >= LEAST_RATED_S else ""
+            print(step if total == 1 else f"{step}: {done} of {total}{rate}", file=sys.stderr, flush=True)
             printed[step] = part
 
     return progress

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from mapless.geodesy import Datum
 from mapless.geometry import Quaternion
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
+from mapless.v1 import reference_service_pb2_grpc as reference_rpcs
 
 DATUM = Datum(47.0, 8.0, 400.0, Quaternion(0.1, -0.3, 0.3, 0.9))
 FAST = ConnectOptions(initial_backoff_s=0.01, max_backoff_s=0.02)
@@ -265,3 +267,27 @@ def test_one_connection_serves_all_calls_of_the_program(
     done = subprocess.run([sys.executable, "-c", CALL, photo], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "[ 0.  2. -1.]\n" * 2
     assert done.stderr == ""
+
+
+@both
+def test_a_message_is_read_while_another_is_computed(connect: Connect) -> None:
+    """Two messages at a time; references are returned in order."""
+    begun = threading.Barrier(2, timeout=20)
+
+    class Slow(reference_rpcs.ReferenceServiceServicer):
+        def BatchCreateReferences(self, request: Any, context: Any) -> Any:  # noqa: N802
+            begun.wait()
+            answer = reference_pb.BatchCreateReferencesResponse()
+            for it in request.requests:
+                it.reference.name = f"{request.scene}/references/{it.reference_id}"
+                answer.references.append(it.reference)
+            return answer
+
+    server = grpc.server(ThreadPoolExecutor(4))
+    reference_rpcs.add_ReferenceServiceServicer_to_server(Slow(), server)
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    with connect(f"127.0.0.1:{port}", ConnectOptions(batch_count=1)) as client:
+        wanted = [NewReference(f"n{i}", PHOTO, CAMERA, pose(i)) for i in range(4)]
+        assert [it.reference_id for it in client.add_references("s", wanted)] == ["n0", "n1", "n2", "n3"]
+    server.stop(None).wait()

@@ -2,7 +2,8 @@
 
 import re
 import warnings
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
+from contextlib import aclosing
 from functools import partial
 from typing import Any
 
@@ -167,10 +168,10 @@ async def add_references(
 ) -> list[Reference]:
     """Stores many references, in as many messages as needed.
 
-    A message is stored whole or not at all. When one fails, the references of earlier messages remain stored:
-    call this again with all of them. Those that the scene has already, with the same photograph, intrinsics and
-    pose, are not stored again, and are returned and counted like the others; AlreadyExists names one that the scene
-    has with another photograph, intrinsics or pose.
+    The next message is read and sent while the server computes the one before. A message is stored whole or not at all.
+    When one fails, the references of other messages remain stored: call this again with all of them. Those that the
+    scene has already, with the same photograph, intrinsics and pose, are not stored again, and are returned and counted
+    like the others; AlreadyExists names one that the scene has with another photograph, intrinsics or pose.
 
     Args:
         scene: the scene.
@@ -180,11 +181,15 @@ async def add_references(
     """
     stored: list[Reference] = []
     there: dict[str, Reference] = {}
-    batches = _batches(scene, references, connection.options)
-    while batch := await connection.unblocked(next, batches, None):
-        stored += await add_batch(connection, scene, batch, timeout_s, there)
-        if on_progress is not None:
-            on_progress(len(stored))
+
+    def add(batch: Sequence[pb.CreateReferenceRequest]) -> Coroutine[Any, Any, list[Reference]]:
+        return add_batch(connection, scene, batch, timeout_s, there)
+
+    async with aclosing(connection.pipelined(add, _batches(scene, references, connection.options))) as added:
+        async for some in added:
+            stored += some
+            if on_progress is not None:
+                on_progress(len(stored))
     return stored
 
 
@@ -215,7 +220,8 @@ async def add_batch(
             f"{scene_name(scene)}/references/{it.reference_id}": it
             async for it in list_references(connection, scene, page_size=_PAGE_SIZE, timeout_s=timeout_s)
         }
-        if known.keys().isdisjoint(set(names) - there.keys()):
+        # Another message of this upload may have listed them meanwhile.
+        if known.keys().isdisjoint(reference_name(scene, it.reference_id) for it in new):
             raise
         there |= known
         return await add_batch(connection, scene, requests, timeout_s, there)

@@ -235,6 +235,7 @@ def _store(report: ImportReport, options: ImportOptions, settings: Settings, con
             _warn(report, contradictions(poses, attributes))
             _warn(report, [another_unit([it.world_from_camera for it in existing], poses)])
             Uploader(client, KnownReferences(existing), report, options.parallel, progress).run()
+            report.pending = client.get_scene(report.scene).pending_work
     except WrongUnit as error:
         report.stopped = str(error)
     except (MaplessError, ServerFailed) as error:

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
+from mapless import PendingWork
 from mapless_server.method.pairs.readings.alignment import Alignment
 from mapless_server.method.pairs.readings.verdict import Verdict
 from mapless_server.scenes.repeats import same_pose_text
@@ -31,7 +32,8 @@ class ImportReport:
 
     Of the chosen frames, `added` are the ids of stored references, `blank` those without local features, with which
     nothing can be matched; skipped ones exist already. Warnings are contradictions of poses, datum, direction of
-    gravity and unit. `stopped` says why the import ended before its end. The verdict is None if there was no epipolar
+    gravity and unit. `stopped` says why the import ended before its end, `pending` what the server has still to make in
+    the background. The verdict is None if there was no epipolar
     check, that with the scene's references if there were none.
     """
 
@@ -47,6 +49,7 @@ class ImportReport:
     refused: list[Refusal] = field(default_factory=list)
     stopped: str = ""
     seconds: float = 0.0
+    pending: Sequence[PendingWork] = ()
     is_dry: bool = False
 
     def __post_init__(self) -> None:
@@ -138,6 +141,8 @@ def print_report(report: ImportReport, console: Console) -> None:
     if report.untried_count:
         counts.append(f"{report.untried_count} not reached")
     console.print(f"scene {report.scene}: {', '.join(counts)}", markup=False, highlight=False)
+    for it in report.pending:
+        console.print(f"left to the server's background: {it}", markup=False, highlight=False)
     if report.stopped:
         console.print(f"stopped: {report.stopped}", markup=False, highlight=False)
         if report.added:
@@ -164,6 +169,7 @@ def to_json(report: ImportReport) -> dict[str, Any]:
         "not_reached": report.untried_count,
         "stopped": report.stopped,
         "seconds": report.seconds,
+        "pending_work": [vars(it) for it in report.pending],
         "scene_check": None if report.scene_verdict is None else _scene_verdict_json(report.scene_verdict),
         "check": None if verdict is None else _verdict_json(verdict, report.chosen),
     }
