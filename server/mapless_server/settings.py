@@ -108,7 +108,7 @@ class Settings(BaseModel):
     reference_cache_mib: int = Field(default=512, ge=0)
     """Memory for references' features, MiB."""
     background_matching: bool = True
-    """Whether references are matched with one another when the server is idle, so that queries need not."""
+    """Whether further features and matches of references are made when the server is idle, so that queries need not."""
     coverage: float = Field(default=0.95, gt=0, lt=1)
     """Share of right answers to accept where a request sets none; a larger one also accepts more wrong answers."""
     allow_watching: bool = False
