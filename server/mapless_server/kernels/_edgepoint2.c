@@ -210,32 +210,42 @@ ALWAYS void join_row(const DescriptorHead *head, Index y, const uint8_t *needed,
     }
 }
 
-/* The map after its grouped 3x3 layer, at pixels (count) of the map; `joined` is surrounded by zeros. */
-WIDE static void convolve_groups(const DescriptorHead *head, const float *joined, const Index *pixels, Index count,
-                                 float *to) {
-    const Index joint = head->joint, wide = head->width + 2;
+/* Rows of the joined map, each surrounded by a pixel of zeros: the last four that were computed. */
+static float *joined_row(const DescriptorHead *head, float *ring, Index y) {
+    return ring + (y & (RING - 1)) * (head->width + 2) * head->joint;
+}
+
+/* The map after its grouped 3x3 layer, at columns (count) of row y. */
+ALWAYS void convolve_groups(const DescriptorHead *head, float *ring, const float *nothing, Index y, const Index *columns,
+                            Index count, float *to) {
+    const Index joint = head->joint;
+    const float *rows[SIDE];
+    for (Index r = 0; r < SIDE; r++) {
+        const Index source = y + r - 1;
+        rows[r] = source < 0 || source >= head->height ? nothing : joined_row(head, ring, source);
+    }
     for (Index g = 0; g < joint / LANES; g++) {
         Lanes bias;
         load(&bias, head->grouped_bias + g * LANES);
         for (Index i = 0; i < count; i += PIXELS) {
-            const float *sources[PIXELS];
+            Index sources[PIXELS];
             Lanes sums[PIXELS], weights;
-            UNROLLED
             for (int p = 0; p < PIXELS; p++) {
-                const Index pixel = pixels[i + p < count ? i + p : count - 1];
-                sources[p] = joined + (pixel / head->width * wide + pixel % head->width) * joint + g * LANES;
+                sources[p] = columns[i + p < count ? i + p : count - 1] * joint + g * LANES;
                 sums[p] = bias;
             }
             for (int t = 0; t < TAPS; t++) {
-                const Index shift = (t / SIDE * wide + t % SIDE) * joint;
                 const float *its = head->grouped + (g * TAPS + t) * LANES * LANES;
+                const float *row = rows[t / SIDE] + t % SIDE * joint;
                 for (int c = 0; c < LANES; c++) {
                     load(&weights, its + c * LANES);
                     UNROLLED
-                    for (int p = 0; p < PIXELS; p++) sums[p] += sources[p][shift + c] * weights;
+                    for (int p = 0; p < PIXELS; p++) sums[p] += row[sources[p] + c] * weights;
                 }
             }
-            for (int p = 0; p < PIXELS && i + p < count; p++) {
+            UNROLLED
+            for (int p = 0; p < PIXELS; p++) {
+                if (i + p >= count) continue;
                 store(to + (i + p) * joint + g * LANES, &sums[p]);
                 relu(to + (i + p) * joint + g * LANES, LANES);
             }
@@ -243,10 +253,18 @@ WIDE static void convolve_groups(const DescriptorHead *head, const float *joined
     }
 }
 
-WIDE static void join(const DescriptorHead *head, const uint8_t *needed, float *blended, float *joined) {
-    const Index wide = head->width + 2;
-    for (Index y = 0; y < head->height; y++)
-        join_row(head, y, needed + y * head->width, blended, joined + ((y + 1) * wide + 1) * head->joint);
+/* The map at pixels (count), in order; `needed` are the pixels around these. `memory` is of zeros. */
+WIDE static void compute_map(const DescriptorHead *head, const uint8_t *needed, const Index *columns, const Index *row_end,
+                             float *memory, float *map) {
+    const Index size = (head->width + 2) * head->joint;
+    float *nothing = memory + RING * size, *blended = nothing + size;
+    for (Index y = 0; y <= head->height; y++) {
+        if (y < head->height)
+            join_row(head, y, needed + y * head->width, blended, joined_row(head, memory, y) + head->joint);
+        if (!y) continue;
+        const Index begin = y > 1 ? row_end[y - 2] : 0;
+        convolve_groups(head, memory, nothing, y - 1, columns + begin, row_end[y - 1] - begin, map + begin * head->joint);
+    }
 }
 
 /* The four pixels around a keypoint and their shares; -1 beyond the map, where it is zero. */
@@ -265,12 +283,11 @@ static void corners(const DescriptorHead *head, const double keypoint[2], Index 
 /* Samples (count, J) of the map at keypoints (count, 2), x and y in pixels of the photograph. 0 without memory. */
 static int sample(const DescriptorHead *head, const double *keypoints, Index count, float *samples) {
     const Index width = head->width, height = head->height, joint = head->joint, size = width * height;
-    Index *rows = malloc((size_t)(2 * size + 1) * sizeof(Index)), *pixels = rows + size; /* of each pixel; the pixels */
+    /* Of each pixel its row in the map, or -1; columns of the pixels in the map; where they end in each row. */
+    Index *rows = malloc((size_t)(2 * size + height) * sizeof(Index)), *columns = rows + size, *row_end = columns + size;
     uint8_t *needed = calloc((size_t)size, 1);
-    float *joined = calloc((size_t)((width + 2) * (height + 2) * joint), sizeof(float));
-    float *blended = malloc((size_t)(width * joint) * sizeof(float)), *map = NULL;
-    int done = rows && needed && joined && blended;
-    if (done) {
+    float *memory = calloc((size_t)((RING + 1) * (width + 2) * joint + width * joint), sizeof(float)), *map = NULL;
+    if (rows && needed && memory) {
         Index found = 0, around[4];
         float shares[4];
         for (Index i = 0; i < size; i++) rows[i] = -1;
@@ -279,18 +296,16 @@ static int sample(const DescriptorHead *head, const double *keypoints, Index cou
             for (int i = 0; i < 4; i++)
                 if (around[i] >= 0) rows[around[i]] = 0;
         }
-        for (Index i = 0; i < size; i++) {
-            if (rows[i] < 0) continue;
-            rows[i] = found, pixels[found++] = i;
-            const Index x = i % width, y = i / width;
-            for (Index v = y ? y - 1 : 0; v <= y + 1 && v < height; v++)
-                for (Index u = x ? x - 1 : 0; u <= x + 1 && u < width; u++) needed[v * width + u] = 1;
-        }
+        for (Index y = 0; y < height; row_end[y++] = found)
+            for (Index x = 0; x < width; x++) {
+                if (rows[y * width + x] < 0) continue;
+                rows[y * width + x] = found, columns[found++] = x;
+                for (Index v = y ? y - 1 : 0; v <= y + 1 && v < height; v++)
+                    for (Index u = x ? x - 1 : 0; u <= x + 1 && u < width; u++) needed[v * width + u] = 1;
+            }
         map = malloc((size_t)(found * joint + 1) * sizeof(float));
-        done = map != NULL;
-        if (done) {
-            join(head, needed, blended, joined);
-            convolve_groups(head, joined, pixels, found, map);
+        if (map) {
+            compute_map(head, needed, columns, row_end, memory, map);
             memset(samples, 0, (size_t)(count * joint) * sizeof(float));
             for (Index k = 0; k < count; k++) {
                 corners(head, keypoints + 2 * k, around, shares);
@@ -302,7 +317,8 @@ static int sample(const DescriptorHead *head, const double *keypoints, Index cou
             }
         }
     }
-    free(rows), free(needed), free(joined), free(blended), free(map);
+    const int done = map != NULL;
+    free(rows), free(needed), free(memory), free(map);
     return done;
 }
 
