@@ -322,6 +322,27 @@ static int sample(const DescriptorHead *head, const double *keypoints, Index cou
     return done;
 }
 
+/* Pixels of a map (height, width) above a threshold and all others of their 5x5 window, row by row, but for those at a
+ * border of at least two pixels. `found` (2, room) has their rows, then their columns; -1 if there are more. */
+enum { MARGIN = 2 };
+
+static Index find_maxima(const float *map, Index height, Index width, Index border, float threshold, int32_t *found,
+                         Index room) {
+    Index count = 0;
+    for (Index y = border; y < height - border; y++)
+        for (Index x = border; x < width - border; x++) {
+            const float *here = map + y * width + x, value = *here;
+            if (!(value > threshold) || !(value > here[1]) || !(value > here[-1])) continue;
+            int is_largest = 1;
+            for (Index v = -MARGIN; v <= MARGIN && is_largest; v++)
+                for (Index u = -MARGIN; u <= MARGIN; u++) is_largest &= (!u && !v) || value > here[v * width + u];
+            if (!is_largest) continue;
+            if (count == room) return -1;
+            found[count] = (int32_t)y, found[room + count++] = (int32_t)x;
+        }
+    return count;
+}
+
 enum { MOST_ARRAYS = 12 };
 
 typedef struct {
@@ -415,12 +436,33 @@ static PyObject *samples_call(PyObject *Py_UNUSED(module), PyObject *arguments) 
     return done ? Py_NewRef(Py_None) : PyErr_NoMemory();
 }
 
+static PyObject *maxima_call(PyObject *Py_UNUSED(module), PyObject *arguments) {
+    Py_buffer map, found;
+    Py_ssize_t height, width, border;
+    float threshold;
+    if (!PyArg_ParseTuple(arguments, "nnnfy*w*", &height, &width, &border, &threshold, &map, &found)) return NULL;
+    const Index room = found.len / (2 * (Index)sizeof(int32_t));
+    Index count = -1;
+    if (height > 0 && width > 0 && border >= MARGIN && map.len / (Index)sizeof(float) / width == height &&
+        map.len == height * width * (Index)sizeof(float)) {
+        Py_BEGIN_ALLOW_THREADS
+        count = find_maxima(map.buf, height, width, border, threshold, found.buf, room);
+        Py_END_ALLOW_THREADS
+    }
+    PyBuffer_Release(&map);
+    PyBuffer_Release(&found);
+    if (count >= 0) return PyLong_FromSsize_t(count);
+    PyErr_SetString(PyExc_ValueError, "the sizes of the arrays do not fit");
+    return NULL;
+}
+
 static PyObject *is_fast(PyObject *Py_UNUSED(module), PyObject *Py_UNUSED(arguments)) {
     return PyBool_FromLong(IS_FAST);
 }
 
 static PyMethodDef methods[] = {
     {"is_fast", is_fast, METH_NOARGS, "Whether this processor has the vectors that it is compiled for."},
+    {"maxima", maxima_call, METH_VARARGS, "Writes strict maxima and returns their number; see edgepoint2.py."},
     {"scores", scores_call, METH_VARARGS, "Writes logits; see edgepoint2.py."},
     {"samples", samples_call, METH_VARARGS, "Writes samples of the descriptors' map; see edgepoint2.py."},
     {NULL, NULL, 0, NULL},

@@ -80,3 +80,15 @@ def samples(
     given = quarter, first.weights, first.bias, eighth, last, second.weights, second.bias, keypoints
     _edgepoint2.samples(channels, found.shape[1], height, width, *map(np.ascontiguousarray, given), found)
     return found
+
+
+def maxima(logits: Float, threshold: float, border: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns (N,) of pixels above the threshold and all others of their 5x5 window, row by row.
+
+    Those within `border` pixels of the map's border, at least 2, are left out. ValueError where sizes do not fit.
+    """
+    height, width = logits.shape
+    found = np.empty((2, (height // 3 + 1) * (width // 3 + 1)), np.int32)  # no two are in a square of 3x3
+    count = _edgepoint2.maxima(height, width, border, threshold, np.ascontiguousarray(logits), found)
+    row, column = found[:, :count].astype(np.intp)
+    return row, column

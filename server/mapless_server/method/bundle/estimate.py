@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -176,14 +177,23 @@ class PosedSupport(Support):
 
     def distance_m(self) -> float:
         """Median depth of the inliers' points at the estimate; always positive, and next to 0 without points."""
+        return self._distance_m
+
+    @cached_property
+    def _distance_m(self) -> float:
         x_in_world = self.structure.x_in_world[self.matches.point[self.estimate.inliers]]
         if self.two_view is not None:
             x_in_world = np.concatenate([x_in_world, self.two_view.x_in_world[self.two_view.inliers]])
         depth_m = self.estimate.world_from_camera.inverse().apply(x_in_world)[:, 2]
-        return max(float(np.nanmedian(depth_m)) if len(depth_m) else 0.0, float(np.finfo(float).tiny))
+        depth_m = depth_m[~np.isnan(depth_m)]
+        return max(float(np.median(depth_m)) if len(depth_m) else 0.0, float(np.finfo(float).tiny))
 
     def inliers_by_reference(self) -> tuple[int, ...]:
         """Number of inliers on points that each reference observes, and of two-view inliers with it."""
+        return self._inliers_by_reference
+
+    @cached_property
+    def _inliers_by_reference(self) -> tuple[int, ...]:
         seen = observers(self.structure, self.matches.point[self.estimate.inliers])
         if self.two_view is not None:
             seen = np.concatenate([seen, self.two_view.reference[self.two_view.inliers]])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
+from mapless_server.kernels import edgepoint2
 from mapless_server.networks.edgepoint2_sizes import Describe
 
 from ..masks import usable_pixels
@@ -100,6 +101,8 @@ def _logit(score: float) -> float:
 
 def _strict_maxima(logits: Float, threshold: float) -> Pixels:
     """Pixels above the threshold and all others of their window, which lies in the image but for its border."""
+    if edgepoint2.is_available():
+        return edgepoint2.maxima(logits, threshold, BORDER_PX)
     margin = WINDOW_PX // 2
     others = np.ones((WINDOW_PX, WINDOW_PX), np.uint8)
     others[margin, margin] = 0
