@@ -71,7 +71,7 @@ from .masks import IgnoredMask
 from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from .provenance import Provenance
-from .requests import IntrinsicsUncertainty, NewReference
+from .requests import IntrinsicsUncertainty, NewReference, ReadoutDirection
 from .results import Coverage, PendingWork, Reference, ReferenceAudit, RetrievedReference, Scene
 from .scenes import UNCHANGED, Calibration
 from .shortcut import localize
@@ -127,6 +127,7 @@ __all__ = [
     "Provenance",
     "Quaternion",
     "RadialTangential",
+    "ReadoutDirection",
     "Reference",
     "ReferenceAudit",
     "ReferenceUse",

@@ -10,7 +10,7 @@ from .diagnostics import Diagnostics
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
 from .priors import Priors
-from .requests import ImageSource
+from .requests import ImageSource, IntrinsicsUncertainty
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +26,7 @@ class RigImage:
         priors: priors on this camera's pose; soft ones are terms of the joint estimate.
         mask: a PNG of the photograph's size, 0 at the pixels to ignore; None: all are used.
         depth: the depth that a sensor measured with the photograph; None without one.
+        intrinsics_uncertainty: as of `Client.localize`.
     """
 
     image: ImageSource
@@ -35,6 +36,7 @@ class RigImage:
     priors: Priors = field(default_factory=Priors)
     mask: ImageSource | None = None
     depth: DepthImage | None = None
+    intrinsics_uncertainty: IntrinsicsUncertainty | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,7 @@ class SequenceFrame:
         priors: priors on this camera's pose; soft ones are terms of the joint estimate.
         mask: a PNG of the photograph's size, 0 at the pixels to ignore; None: all are used.
         depth: the depth that a sensor measured with the photograph; None without one.
+        intrinsics_uncertainty: as of `Client.localize`.
     """
 
     image: ImageSource
@@ -61,6 +64,7 @@ class SequenceFrame:
     priors: Priors = field(default_factory=Priors)
     mask: ImageSource | None = None
     depth: DepthImage | None = None
+    intrinsics_uncertainty: IntrinsicsUncertainty | None = None
 
 
 @dataclass(frozen=True, eq=False)

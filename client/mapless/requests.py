@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 
 from . import wire
@@ -32,19 +33,39 @@ class NewReference:
     depth: DepthImage | None = None
 
 
+class ReadoutDirection(str, Enum):
+    """Sides of a photograph's raster, as it is stored, that a rolling shutter reads first and last."""
+
+    TOP_TO_BOTTOM = "top_to_bottom"
+    BOTTOM_TO_TOP = "bottom_to_top"
+    LEFT_TO_RIGHT = "left_to_right"
+    RIGHT_TO_LEFT = "right_to_left"
+    """Of a raster that was turned clockwise by a quarter, as upright photographs of phones held upright."""
+
+
 @dataclass(frozen=True)
 class IntrinsicsUncertainty:
-    """Standard deviations of a photograph's intrinsics; 0 for the server's default.
+    """Standard deviations of a photograph's intrinsics, and the read-out of its shutter; 0 for the server's default.
 
     Attributes:
         focal_sigma_px: standard deviation of both focal lengths together, pixels along x; by default 0.3 % of it.
         principal_sigma_px: standard deviation of each coordinate of the principal point; by default 0.3 % of the width.
         k1_sigma: standard deviation of the first distortion coefficient; by default 0.01.
+        readout_s: time from reading the first row to reading the last one, seconds, at most 0.2; 0 for a global
+            shutter, or if nothing is known of it.
+        readout_direction: which side is read first.
+        speed_m_per_s: standard deviation of each component of the camera's speed while it moves; by default the one
+            that moves the image as much as the angular speed.
+        turn_deg_per_s: standard deviation of its angular speed about each axis; by default 90.
     """
 
     focal_sigma_px: float = 0.0
     principal_sigma_px: float = 0.0
     k1_sigma: float = 0.0
+    readout_s: float = 0.0
+    readout_direction: ReadoutDirection | str = ReadoutDirection.TOP_TO_BOTTOM
+    speed_m_per_s: float = 0.0
+    turn_deg_per_s: float = 0.0
 
 
 def create_request(

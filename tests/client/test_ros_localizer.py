@@ -260,6 +260,7 @@ def test_a_rejected_image_is_localized_with_those_before(client: PlantedClient) 
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
+        ({"readout_s": 33.0}, "readout_s must be 0 to 0.2 s, is 33"),
         ({"sequence_length": 1}, "sequence_length must be 0 or 2 to 16 images, is 1"),
         ({"sequence_length": 4, "odom_frame": ""}, "sequence_length needs odom_frame"),
         ({"map_frame": "odom"}, "map_frame"),

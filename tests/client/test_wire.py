@@ -12,7 +12,7 @@ from mapless import Client, names, wire
 from mapless.geometry import MAX_COORDINATE_M, Camera, RigidTransform
 from mapless.groups import RigImage, SequenceFrame
 from mapless.priors import PositionPrior, Priors, set_priors
-from mapless.requests import NewReference, create_request
+from mapless.requests import IntrinsicsUncertainty, NewReference, create_request
 from mapless.v1 import geometry_pb2 as pb
 from mapless.v1.localization_service_pb2 import LocalizeRequest
 
@@ -85,6 +85,12 @@ def changed(**values: Any) -> Camera:
 def test_a_value_of_another_type_is_named(convert: Callable[[Any], Any], value: Any, error_text: str) -> None:
     with pytest.raises(TypeError, match=error_text):
         convert(value)
+
+
+def test_an_unknown_side_of_a_read_out_is_named() -> None:
+    uncertainty = IntrinsicsUncertainty(readout_s=0.03, readout_direction="down")
+    with pytest.raises(ValueError, match="ReadoutDirection must be one of top_to_bottom, bottom_to_top, left_to"):
+        Client("localhost").localize(b"x", CAMERA, "s", intrinsics_uncertainty=uncertainty)
 
 
 def test_a_prior_with_too_few_coordinates_is_named() -> None:

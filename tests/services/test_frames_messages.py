@@ -20,6 +20,8 @@ from mapless.wire import FieldError
 from mapless_server.engine.options import EngineOptions
 from mapless_server.images import ImageLimits
 from mapless_server.method.bundle.priors import IntrinsicsSigma
+from mapless_server.method.bundle.readout import ReadoutDirection, RollingShutter
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.services.messages.answers import (
     axes_from_message,
@@ -160,8 +162,42 @@ def test_zeros_are_the_defaults_and_absence_leaves_the_choice() -> None:
 def test_bad_standard_deviations_are_named_with_their_bound(field: str, most: float, value: float) -> None:
     message = re.escape(f"above 0 and at most {most:g}, or 0 for the default, is {value:g}")
     with pytest.raises(FieldError, match=message) as caught:
-        sigma_of(pb.IntrinsicsUncertainty(**{field: value}))
+        sigma_of(pb.IntrinsicsUncertainty(**{field: value}))  # type: ignore[arg-type]
     assert caught.value.field == f"intrinsics_uncertainty.{field}"
+
+
+def shutter_of(**given: float) -> LocalizeOptions:
+    uncertainty = pb.IntrinsicsUncertainty()
+    for field, value in given.items():
+        setattr(uncertainty, field, value)
+    request = pb.LocalizeRequest(scene="scenes/hall", image=PHOTO, intrinsics_uncertainty=uncertainty)
+    return query_from_message(request, "", EngineOptions(), SceneAttributes()).options
+
+
+def test_a_read_out_needs_no_intrinsics_and_leaves_their_sigma() -> None:
+    found = shutter_of(readout_s=0.03, readout_direction=pb.READOUT_DIRECTION_RIGHT_TO_LEFT, speed_m_per_s=1.5)
+    assert found.shutter == RollingShutter(0.03, ReadoutDirection.RIGHT_TO_LEFT, 1.5)
+    assert found.intrinsics is None
+    assert sigma_of(pb.IntrinsicsUncertainty(readout_s=0.03)) is None
+    assert sigma_of(pb.IntrinsicsUncertainty(readout_s=0.03, k1_sigma=0.05)) == IntrinsicsSigma(k1=0.05)
+    assert sigma_of(pb.IntrinsicsUncertainty(turn_deg_per_s=0)) == IntrinsicsSigma()
+
+
+@pytest.mark.parametrize("value", [-0.01, math.nan, math.inf, 1e5])
+@pytest.mark.parametrize(("field", "most"), [("readout_s", 0.2), ("speed_m_per_s", 1000), ("turn_deg_per_s", 3600)])
+def test_bad_read_outs_and_speeds_are_named_with_their_bound(field: str, most: float, value: float) -> None:
+    with pytest.raises(FieldError, match=re.escape(f"must be 0 to {most:g}, is {value:g}")) as caught:
+        shutter_of(**{"readout_s": 0.03, field: value})
+    assert caught.value.field == f"intrinsics_uncertainty.{field}"
+
+
+def test_speeds_and_sigmas_without_their_owner_are_refused() -> None:
+    with pytest.raises(FieldError, match="is of a rolling shutter, and readout_s is 0"):
+        shutter_of(speed_m_per_s=1.0)
+    with pytest.raises(FieldError, match="is that of intrinsics, and there are none"):
+        shutter_of(readout_s=0.03, focal_sigma_px=3.0)
+    with pytest.raises(FieldError, match="must be one of ReadoutDirection's values, is 9"):
+        shutter_of(readout_s=0.03, readout_direction=9)
 
 
 def test_a_rejection_carries_its_checks_to_the_client() -> None:

@@ -65,8 +65,8 @@ async def _localize_request(
         scene: the scene to localize in.
         references: the references to use, most similar first, at most 64; empty: the server chooses.
         priors: knowledge of the pose before the photograph is used, for example its position.
-        intrinsics_uncertainty: standard deviations of the camera's intrinsics; None for the defaults, which are smaller
-            where the references have the same camera.
+        intrinsics_uncertainty: standard deviations of the camera's intrinsics, and the read-out of a rolling shutter;
+            None for the defaults, which are smaller where the references have the same camera, and a global shutter.
         variant: "best" (default), "full", "no_structure" or "coarse".
         scale_strategy: "two_stage" (default), "triangulation" or "trajectory".
         reference_count: number of references that the server chooses; 0 for its default.
@@ -115,7 +115,8 @@ async def _localize_request(
     )
     set_priors(request, priors or Priors())
     if intrinsics_uncertainty is not None:
-        request.intrinsics_uncertainty.CopyFrom(_uncertainty_to_message(intrinsics_uncertainty))
+        uncertainty = _uncertainty_to_message(intrinsics_uncertainty, "intrinsics_uncertainty")
+        request.intrinsics_uncertainty.CopyFrom(uncertainty)
     if capture_time is not None:
         wire.set_time(request.capture_time, capture_time, "capture_time")
     if session_from_camera is not None:
@@ -294,10 +295,10 @@ def _check_depths(
         warnings.warn(IgnoredDepth("photographs"), stacklevel=2)
 
 
-def _uncertainty_to_message(uncertainty: IntrinsicsUncertainty) -> pb.IntrinsicsUncertainty:
-    advice = "such as IntrinsicsUncertainty(focal_sigma_px=20)"
-    wire.require(uncertainty, IntrinsicsUncertainty, "intrinsics_uncertainty", advice)
-    return pb.IntrinsicsUncertainty(**asdict(uncertainty))
+def _uncertainty_to_message(uncertainty: IntrinsicsUncertainty, field: str) -> pb.IntrinsicsUncertainty:
+    wire.require(uncertainty, IntrinsicsUncertainty, field, "such as IntrinsicsUncertainty(focal_sigma_px=20)")
+    direction = wire.enum_value(pb.ReadoutDirection, uncertainty.readout_direction)
+    return pb.IntrinsicsUncertainty(**{**asdict(uncertainty), "readout_direction": direction})
 
 
 def _options_to_message(**values: Any) -> pb.LocalizeOptions:
@@ -316,6 +317,9 @@ def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: s
         message.depth.CopyFrom(depth_to_message(given.depth, f"{field}.depth"))
     if given.camera is not None:
         message.intrinsics.CopyFrom(wire.camera_to_message(given.camera, f"{field}.camera"))
+    if given.intrinsics_uncertainty is not None:
+        uncertainty = _uncertainty_to_message(given.intrinsics_uncertainty, f"{field}.intrinsics_uncertainty")
+        message.intrinsics_uncertainty.CopyFrom(uncertainty)
     message.references.extend(reference_names(scene, given.references))
     set_priors(message, given.priors, f"{field}.priors")
     return message

@@ -18,6 +18,7 @@ from mapless_command.installation import how_to_install
 from ..client import Client
 from ..depth import DepthSensor
 from ..options import ConnectOptions
+from ..requests import ReadoutDirection
 from ..shortcut import ADDRESS_VARIABLE, TOKEN_VARIABLE, default_address
 from ..text_files import read_text
 from . import commands, doctor, localize
@@ -386,6 +387,7 @@ def _add_localize(command: argparse.ArgumentParser) -> None:
             f"--{name}-sigma", type=float, default=0.0, metavar=unit,
             help=f"standard deviation of {text} (default: the server's)",
         )  # fmt: skip
+    _add_shutter(command)
     command.add_argument("--axes", default="", help="opencv, arkit, arcore, unity or ros: adds the pose in these axes")
     command.add_argument(
         "--coverage", type=float, default=0.0, help="share of right answers to accept (default: the server's)"
@@ -453,6 +455,25 @@ def _add_limits(command: argparse.ArgumentParser) -> argparse._ArgumentGroup:
         help="hard limit of the viewing direction: a direction in the world, and degrees around it",
     )
     return group
+
+
+def _add_shutter(command: argparse.ArgumentParser) -> None:
+    """The read-out of a rolling shutter."""
+    command.add_argument(
+        "--readout", type=float, default=0.0, metavar="S",
+        help="seconds from the first to the last row of a rolling shutter, at most 0.2 (default: a global shutter)",
+    )  # fmt: skip
+    command.add_argument(
+        "--readout-direction",
+        choices=[it.value for it in ReadoutDirection],
+        default=ReadoutDirection.TOP_TO_BOTTOM.value,
+        help="which side of the file's raster is read first (default: %(default)s)",
+    )
+    for name, unit, text in (("speed", "M_PER_S", "speed"), ("turn", "DEG_PER_S", "angular speed")):
+        command.add_argument(
+            f"--{name}", type=float, default=0.0, metavar=unit,
+            help=f"standard deviation of the camera's {text} while it moves (default: the server's)",
+        )  # fmt: skip
 
 
 def _add_priors(command: argparse.ArgumentParser) -> None:

@@ -21,7 +21,7 @@ from ..errors import InvalidArgument, MaplessError
 from ..geometry import Camera
 from ..masks import find_mask, mask_name
 from ..priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
-from ..requests import ImageSource, IntrinsicsUncertainty
+from ..requests import ImageSource, IntrinsicsUncertainty, ReadoutDirection
 from . import output
 from .folder import EXIT_REJECTED, Concurrency, LimitedClient, Outcome, Tally
 
@@ -294,8 +294,16 @@ def _pose_prior(pose: str, position_sigma_m: str, rotation_sigma_deg: str) -> Po
 
 
 def intrinsics_uncertainty(arguments: argparse.Namespace) -> IntrinsicsUncertainty | None:
-    """The standard deviations that the command line gives; None without any."""
-    given = IntrinsicsUncertainty(arguments.focal_sigma, arguments.principal_sigma, arguments.k1_sigma)
+    """The standard deviations and the read-out that the command line gives; None without any."""
+    given = IntrinsicsUncertainty(
+        arguments.focal_sigma,
+        arguments.principal_sigma,
+        arguments.k1_sigma,
+        arguments.readout,
+        ReadoutDirection(arguments.readout_direction),
+        arguments.speed,
+        arguments.turn,
+    )
     return None if given == IntrinsicsUncertainty() else given
 
 

@@ -16,7 +16,7 @@ from mapless.errors import MaplessError
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless.groups import SequenceFrame, SequenceLocalization
 from mapless.priors import PosePrior, Priors
-from mapless.requests import ImageSource, read_mask
+from mapless.requests import ImageSource, IntrinsicsUncertainty, read_mask
 
 from .cameras import RosCamera
 from .depths import RosDepth
@@ -40,6 +40,9 @@ LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.02, 0.01
 ODOMETRY_DRIFT = 0.1
 """Standard deviation of odometry, as a share of the way and the angle: wheels slip."""
 
+MAX_READOUT_S = 0.2
+"""Longest read-out that servers take."""
+
 SPEED_M_S, TURN_RAD_S, GUESS_LIFE_S = 1.5, 1.5, 5.0
 """Without odometry: how fast a robot may have moved since, and how long its last pose says anything."""
 
@@ -61,6 +64,7 @@ class LocalizerOptions:
         sequence_length: largest number of images, 2 to 16, with which an image that is rejected alone is localized
             together, by the odometry between them; 0 for never. This takes as long as localizing all of them.
         mask: a PNG of the camera's size that is 0 where the camera sees the robot itself, or its path; None for none.
+        readout_s: seconds that a rolling shutter takes from the first row to the last one; 0 for a global shutter.
     """
 
     scene: str
@@ -73,6 +77,7 @@ class LocalizerOptions:
     timeout_s: float = 5.0
     sequence_length: int = 0
     mask: ImageSource | None = None
+    readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.scene:
@@ -83,6 +88,8 @@ class LocalizerOptions:
             raise ValueError(f"rate must be 0 to 1000 images a second, is {self.rate_hz:g}")
         if not self.timeout_s > 0:
             raise ValueError(f"timeout must be above 0 s, is {self.timeout_s:g}")
+        if not 0 <= self.readout_s <= MAX_READOUT_S:
+            raise ValueError(f"readout_s must be 0 to {MAX_READOUT_S:g} s, is {self.readout_s:g}")
         if self.sequence_length not in (0, *range(2, 17)):
             raise ValueError(f"sequence_length must be 0 or 2 to 16 images, is {self.sequence_length}")
         if self.sequence_length and not self.odom_frame:
@@ -132,6 +139,7 @@ class Localizer:
         self._client = client
         self._options = options
         self._mask = read_mask(options.mask)
+        self._uncertainty = IntrinsicsUncertainty(readout_s=options.readout_s) if options.readout_s else None
         self._lookup = lookup
         self._lock = threading.Lock()
         self._guess: _Guess | None = None
@@ -196,6 +204,7 @@ class Localizer:
                 coverage=coverage,
                 capture_time=time_of(stamp_ns),
                 mask=self._mask,
+                intrinsics_uncertainty=self._uncertainty,
                 depth=depth,
                 timeout_s=timeout_s,
             )
@@ -203,7 +212,15 @@ class Localizer:
                 tracked = odom_from_body.compose(extrinsics)
                 # The last answer as a prior of several would be counted several times.
                 own = Priors() if self._options.use_last_pose else priors
-                frame = SequenceFrame(photo, camera.camera, tracked, time_of(stamp_ns), priors=own, mask=self._mask)
+                frame = SequenceFrame(
+                    photo,
+                    camera.camera,
+                    tracked,
+                    time_of(stamp_ns),
+                    priors=own,
+                    mask=self._mask,
+                    intrinsics_uncertainty=self._uncertainty,
+                )
                 self._recent.append(replace(frame, depth=depth))
                 if isinstance(answer, Rejected) and len(self._recent) > 1:
                     together = self._client.localize_sequence(

@@ -9,6 +9,14 @@ from typing import ClassVar as _ClassVar, Iterable as _Iterable, Mapping as _Map
 
 DESCRIPTOR: _descriptor.FileDescriptor
 
+class ReadoutDirection(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    READOUT_DIRECTION_UNSPECIFIED: _ClassVar[ReadoutDirection]
+    READOUT_DIRECTION_TOP_TO_BOTTOM: _ClassVar[ReadoutDirection]
+    READOUT_DIRECTION_BOTTOM_TO_TOP: _ClassVar[ReadoutDirection]
+    READOUT_DIRECTION_LEFT_TO_RIGHT: _ClassVar[ReadoutDirection]
+    READOUT_DIRECTION_RIGHT_TO_LEFT: _ClassVar[ReadoutDirection]
+
 class Axes(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     AXES_UNSPECIFIED: _ClassVar[Axes]
@@ -130,6 +138,11 @@ class PointSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     POINT_SOURCE_KEPT_DEPTH: _ClassVar[PointSource]
     POINT_SOURCE_NETWORK_DEPTH: _ClassVar[PointSource]
     POINT_SOURCE_PHOTOGRAPH_DEPTH: _ClassVar[PointSource]
+READOUT_DIRECTION_UNSPECIFIED: ReadoutDirection
+READOUT_DIRECTION_TOP_TO_BOTTOM: ReadoutDirection
+READOUT_DIRECTION_BOTTOM_TO_TOP: ReadoutDirection
+READOUT_DIRECTION_LEFT_TO_RIGHT: ReadoutDirection
+READOUT_DIRECTION_RIGHT_TO_LEFT: ReadoutDirection
 AXES_UNSPECIFIED: Axes
 AXES_OPENCV: Axes
 AXES_ARKIT: Axes
@@ -246,14 +259,22 @@ class LocalizeRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ...) -> None: ...
 
 class IntrinsicsUncertainty(_message.Message):
-    __slots__ = ("focal_sigma_px", "principal_sigma_px", "k1_sigma")
+    __slots__ = ("focal_sigma_px", "principal_sigma_px", "k1_sigma", "readout_s", "readout_direction", "speed_m_per_s", "turn_deg_per_s")
     FOCAL_SIGMA_PX_FIELD_NUMBER: _ClassVar[int]
     PRINCIPAL_SIGMA_PX_FIELD_NUMBER: _ClassVar[int]
     K1_SIGMA_FIELD_NUMBER: _ClassVar[int]
+    READOUT_S_FIELD_NUMBER: _ClassVar[int]
+    READOUT_DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    SPEED_M_PER_S_FIELD_NUMBER: _ClassVar[int]
+    TURN_DEG_PER_S_FIELD_NUMBER: _ClassVar[int]
     focal_sigma_px: float
     principal_sigma_px: float
     k1_sigma: float
-    def __init__(self, focal_sigma_px: _Optional[float] = ..., principal_sigma_px: _Optional[float] = ..., k1_sigma: _Optional[float] = ...) -> None: ...
+    readout_s: float
+    readout_direction: ReadoutDirection
+    speed_m_per_s: float
+    turn_deg_per_s: float
+    def __init__(self, focal_sigma_px: _Optional[float] = ..., principal_sigma_px: _Optional[float] = ..., k1_sigma: _Optional[float] = ..., readout_s: _Optional[float] = ..., readout_direction: _Optional[_Union[ReadoutDirection, str]] = ..., speed_m_per_s: _Optional[float] = ..., turn_deg_per_s: _Optional[float] = ...) -> None: ...
 
 class PositionPrior(_message.Message):
     __slots__ = ("position_m", "radius_m", "covariance_m2")
@@ -728,7 +749,7 @@ class LocalizeRigRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., images: _Optional[_Iterable[_Union[RigImage, _Mapping]]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
 
 class RigImage(_message.Message):
-    __slots__ = ("image", "intrinsics", "rig_from_camera", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask", "depth")
+    __slots__ = ("image", "intrinsics", "rig_from_camera", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask", "depth", "intrinsics_uncertainty")
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     RIG_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -740,6 +761,7 @@ class RigImage(_message.Message):
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     MASK_FIELD_NUMBER: _ClassVar[int]
     DEPTH_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     rig_from_camera: _geometry_pb2.RigidTransform
@@ -751,7 +773,8 @@ class RigImage(_message.Message):
     pose_prior: PosePrior
     mask: bytes
     depth: _geometry_pb2.DepthImage
-    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ...) -> None: ...
+    intrinsics_uncertainty: IntrinsicsUncertainty
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ...) -> None: ...
 
 class LocalizeRigResponse(_message.Message):
     __slots__ = ("localization", "rejection", "images", "capture_time", "session_from_rig")
@@ -820,7 +843,7 @@ class LocalizeSequenceRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., estimate_session_scale: bool = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ...) -> None: ...
 
 class SequenceFrame(_message.Message):
-    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask", "depth")
+    __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask", "depth", "intrinsics_uncertainty")
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
@@ -833,6 +856,7 @@ class SequenceFrame(_message.Message):
     POSE_PRIOR_FIELD_NUMBER: _ClassVar[int]
     MASK_FIELD_NUMBER: _ClassVar[int]
     DEPTH_FIELD_NUMBER: _ClassVar[int]
+    INTRINSICS_UNCERTAINTY_FIELD_NUMBER: _ClassVar[int]
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
     session_from_camera: _geometry_pb2.RigidTransform
@@ -845,7 +869,8 @@ class SequenceFrame(_message.Message):
     pose_prior: PosePrior
     mask: bytes
     depth: _geometry_pb2.DepthImage
-    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ...) -> None: ...
+    intrinsics_uncertainty: IntrinsicsUncertainty
+    def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ...) -> None: ...
 
 class LocalizeSequenceResponse(_message.Message):
     __slots__ = ("localization", "rejection", "images")

@@ -14,6 +14,7 @@ from mapless.geometry import Camera
 from mapless_server.bounds import check_bounds
 
 from .bundle.priors import IntrinsicsSigma
+from .bundle.readout import RollingShutter
 from .promise import PROMISE, PromiseOptions
 
 
@@ -71,12 +72,14 @@ class LocalizeOptions:
             (see `judge.judge`). Evidence: coverage.
         intrinsics: standard deviations of the photograph's intrinsics; None for the defaults, which are smaller where
             the references have the same camera.
+        shutter: the read-out by a rolling shutter; None for a global one, or if nothing is known of it.
     """
 
     variant: Variant = Variant.BEST
     scale_strategy: ScaleStrategy = ScaleStrategy.TWO_STAGE
     coverage: float = 0.95
     intrinsics: IntrinsicsSigma | None = None
+    shutter: RollingShutter | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self, "coverage", above=0, at_most=1)

@@ -337,11 +337,17 @@ def structure_and_matches(coarse: Coarse, scale: MetricScale) -> tuple[Structure
             structure = build_structure(reconstruction, scale, references, correspondences, prepared.structure_options)
             if prepared.options.variant is Variant.BEST and any(it.depths is not None for it in references):
                 structure = with_kept_depths(structure, references, correspondences)
+    return structure, matches_of(coarse, scale, structure)
+
+
+def matches_of(coarse: Coarse, scale: MetricScale, structure: Structure) -> PointMatches:
+    """The query's matches with a structure."""
+    prepared, correspondences = coarse.prepared, coarse.prepared.correspondences
     with prepared.context.stage("match"):
         initial, options = scale.world_from_query, prepared.match_options
         prior_pose = prepared.priors.pose.world_from_camera if prepared.priors.pose else None
-        matches = match_points(prepared.query, references, structure, correspondences, initial, options, prior_pose)
-    return structure, matches
+        given = prepared.query, prepared.references, structure, correspondences
+        return match_points(*given, initial, options, prior_pose)
 
 
 def tracked_support(prepared: Prepared) -> Support | None:

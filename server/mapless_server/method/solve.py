@@ -11,8 +11,9 @@ import numpy as np
 from mapless.geometry import RigidTransform
 
 from .bundle.adjust import adjust_pose, with_covariance
-from .bundle.estimate import PosedSupport, Support, with_halves
+from .bundle.estimate import PosedSupport, PoseEstimate, Support, with_halves
 from .bundle.pose_problem import AdjustInput
+from .bundle.shutter import StillView, row_times, still_view, with_motion, without_motion
 from .features.views import DepthSource, Matches, PosedView, Reconstruction
 from .judge.answer import Answer, Localization
 from .judge.cameras import intrinsics_checks
@@ -35,13 +36,20 @@ from .judge.two_view import (
     without_unmoved,
 )
 from .options import DoubtOptions, Variant
-from .pipeline import Coarse, structure_and_matches, unverified, wide_correspondences, with_wide_correspondences
+from .pipeline import (
+    Coarse,
+    matches_of,
+    structure_and_matches,
+    unverified,
+    wide_correspondences,
+    with_wide_correspondences,
+)
 from .pose.by_depths import MatchedDepths, solve_by_depths
 from .pose.own_depth import checked, contradicted, improved
 from .pose.pnp import gate_failure, solve_pose
 from .pose.two_view import TwoViewOptions, solve_two_view
 from .rejection import Rejection, RejectionReason
-from .structure.model import MetricScale, ScaleSource, ScaleStage
+from .structure.model import MetricScale, PointMatches, ScaleSource, ScaleStage, Structure
 
 
 def solve(coarse: Coarse, attempt: Attempt, doubt: DoubtOptions) -> Found:
@@ -68,15 +76,40 @@ def _from_points(coarse: Coarse) -> Answer:
 
     If the evidence does not suffice, the pose's agreement with gravity and heading counts as evidence, too.
     """
-    prepared, scale, stage = coarse.prepared, coarse.scale, coarse.prepared.context.stage
+    prepared, scale = coarse.prepared, coarse.scale
     if isinstance(scale, Rejection):
         return coarse.answer(scale)
     if prepared.options.variant is Variant.COARSE:
         return coarse.answer(unverified(scale))
     if scale.is_from_depth:
         return _from_one_reference(coarse, scale)
-    query, references, options, priors = prepared.query, prepared.references, prepared.pipeline.options, prepared.priors
     structure, matches = structure_and_matches(coarse, scale)
+    if prepared.options.shutter is None:
+        return _solved(coarse, scale, structure, matches)
+    still = _still(coarse, scale, structure, matches)
+    if still.view is not prepared.query:
+        scale = replace(scale, world_from_query=still.world_from_camera)
+        coarse = replace(coarse, prepared=replace(prepared, query=still.view), scale=scale)
+        matches = matches_of(coarse, scale, structure)
+    return _solved(coarse, scale, structure, matches, still)
+
+
+def _still(coarse: Coarse, scale: MetricScale, structure: Structure, matches: PointMatches) -> StillView:
+    """The photograph as if its camera had stood still while a rolling shutter read it, by matches with points."""
+    prepared = coarse.prepared
+    assert prepared.options.shutter is not None
+    with prepared.context.stage("shutter"):
+        seen = matches.seen(prepared.query, structure.x_in_world)
+        start = scale.world_from_query
+        return still_view(prepared.query, seen, matches.keypoint, start, prepared.options.shutter)
+
+
+def _solved(
+    coarse: Coarse, scale: MetricScale, structure: Structure, matches: PointMatches, still: StillView | None = None
+) -> Answer:
+    """The pose from matches with points, of a photograph that a rolling shutter read if there is a `still` view."""
+    prepared, stage = coarse.prepared, coarse.prepared.context.stage
+    query, references, options, priors = prepared.query, prepared.references, prepared.pipeline.options, prepared.priors
     query_matches = tuple(prepared.correspondences.query_matches)
     sigma = prepared.options.intrinsics
     error_px = prepared.correspondences.reference_error_px
@@ -104,6 +137,9 @@ def _from_points(coarse: Coarse) -> Answer:
         predicted = not prepared.structure_options.optimize
         estimate = with_covariance(posed, scale, options.adjust, priors, predicted)
     posed = replace(posed, estimate=estimate)
+    if still is not None and prepared.options.shutter is not None:
+        with stage("shutter"):
+            posed = replace(posed, estimate=with_motion(posed, still, prepared.options.shutter, options.adjust))
     return _judged(posed if query.depths is None else improved(posed), coarse, chance, agreement)
 
 
@@ -174,6 +210,7 @@ def _by_depths(
             rejection = contradiction(support, votes, prepared.unit, estimate.covariance)
         if rejection:
             return coarse.answer(rejection, support)
+    estimate = _with_shutter(support, coarse)
     return coarse.answer(replace(Localization.of(estimate, trust), scale_source=source), support)
 
 
@@ -218,12 +255,23 @@ def _from_lines(coarse: Coarse) -> Answer:
     if doubt or is_doubted:
         message = doubt or f"the trust of the pose from epipolar lines is {trust:.3f}"
         return coarse.answer(Rejection(RejectionReason.TOO_FEW_MATCHES, message))
-    return coarse.answer(Localization.of(support.estimate, trust, support.two_view), support)
+    return coarse.answer(Localization.of(_with_shutter(support, coarse), trust, support.two_view), support)
+
+
+def _with_shutter(support: PosedSupport, coarse: Coarse) -> PoseEstimate:
+    """The estimate of a support, whose covariance contains what the motion during a read-out may do."""
+    shutter = coarse.prepared.options.shutter
+    if shutter is None:
+        return support.estimate
+    return without_motion(support, row_times(coarse.prepared.query, shutter), shutter)
 
 
 def _two_view_support(coarse: Coarse) -> PosedSupport | None:
     """Finds a pose from two-view matches and wide correspondences."""
-    prepared, options = coarse.prepared, coarse.prepared.pipeline.options
+    prepared, options, scale = coarse.prepared, coarse.prepared.pipeline.options, coarse.scale
+    if prepared.options.shutter is not None and isinstance(scale, MetricScale) and not scale.is_from_depth:
+        still = _still(coarse, scale, *structure_and_matches(coarse, scale))
+        prepared = replace(prepared, query=still.view)
     query, references, context = prepared.query, prepared.references, prepared.context
     with context.stage("two_view"):
         wide = wide_correspondences(prepared)

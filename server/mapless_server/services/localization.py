@@ -40,6 +40,7 @@ from .messages.groups import (
     sequence_to_message,
     session_from_rig_from_message,
     session_poses_from_message,
+    with_tracked_motion,
 )
 from .messages.queries import needs_attributes, query_from_message, scene_key_from_name
 from .watching import Watcher, Watchers
@@ -179,6 +180,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         queries = await self._queries(request, "frames", (MIN_FRAMES, MAX_FRAMES), call)
         axes, session_from_camera = session_poses_from_message(request)
         scale_is_free = request.estimate_session_scale
+        queries = with_tracked_motion(queries, request, session_from_camera)
         pose = partial(pose_sequence, session_from_camera=session_from_camera, estimate_scale=scale_is_free)
         group, outcome = await self._localize_group(queries, call, "frames", pose)
         response = sequence_to_message(outcome, group, queries, request, axes)

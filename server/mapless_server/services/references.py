@@ -32,8 +32,8 @@ from mapless_server.store import (
     Store,
 )
 
+from .messages.enums import message_of
 from .messages.queries import (
-    message_of,
     photo_from_message,
     priors_from_message,
     reference_ids_from_names,

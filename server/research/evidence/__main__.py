@@ -32,6 +32,7 @@ MODULES = {
     "rungs": ("rungs",),
     "readings": ("readings", "suspects"),
     "depth_errors": ("depth-errors",),
+    "rolling_shutter": ("rolling-shutter",),
     "depth_scores": ("depth-scores", "depth-radius"),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }

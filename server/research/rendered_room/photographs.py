@@ -142,19 +142,29 @@ class Settings(NamedTuple):
     noise: float = 1.0
 
 
+def phone_settings(random: np.random.Generator) -> Settings:
+    """Random settings of a phone."""
+    return Settings(
+        random.uniform(0.5, 1.0), random.normal(0, 0.45), 1 + random.normal(0, 0.08), 1 + random.normal(0, 0.08)
+    )
+
+
 def photograph(room: Room, station: Station, seed: int) -> NDArray[np.uint8]:
     """(H, W, 3) sRGB, four rays a pixel, with random settings of a phone."""
     random = np.random.default_rng([seed, 1, *station.name.encode()])
-    settings = Settings(
-        random.uniform(0.5, 1.0), random.normal(0, 0.45), 1 + random.normal(0, 0.08), 1 + random.normal(0, 0.08)
-    )
+    settings = phone_settings(random)
     return developed(room, station, settings, random)
 
 
 def developed(room: Room, station: Station, settings: Settings, random: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) sRGB, four rays a pixel, with what a phone does to the light: blur, exposure, vignetting, noise."""
-    w, h = station.camera.width_px, station.camera.height_px
-    radiance = shade(room, station.camera.resized(2 * w, 2 * h), station.world_from_camera)
+    """(H, W, 3) sRGB, four rays a pixel, with what a phone does to the light."""
+    camera = station.camera.resized(2 * station.camera.width_px, 2 * station.camera.height_px)
+    return exposed(shade(room, camera, station.world_from_camera), settings, random)
+
+
+def exposed(radiance: Floats, settings: Settings, random: np.random.Generator) -> NDArray[np.uint8]:
+    """(H, W, 3) sRGB of radiance at four rays a pixel (2 H, 2 W, 3): blur, exposure, vignetting, noise."""
+    h, w = radiance.shape[0] // 2, radiance.shape[1] // 2
     radiance = np.asarray(cv2.resize(radiance, (w, h), interpolation=cv2.INTER_AREA), np.float32)
     light = np.asarray(cv2.GaussianBlur(radiance, (0, 0), settings.blur_px), np.float32)
     gain = 0.24 / float(np.mean(np.minimum(light, 0.8))) * 2**settings.stops

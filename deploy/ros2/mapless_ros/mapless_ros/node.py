@@ -39,6 +39,7 @@ PARAMETERS: dict[str, Any] = {
     "timeout": 5.0,
     "sequence_length": 0,
     "mask": "",
+    "readout_s": 0.0,
     "depth": False,
     "depth_compressed": False,
     "depth_sensor": "unknown",
@@ -75,6 +76,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
             timeout_s=self._given["timeout"],
             sequence_length=self._given["sequence_length"],
             mask=self._given["mask"] or None,
+            readout_s=self._given["readout_s"],
         )
         self._client = mapless.Client(self._given["address"], self._connect_options())
         self._tf = tf2_ros.Buffer()

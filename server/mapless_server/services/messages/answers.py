@@ -21,7 +21,7 @@ from mapless_server.method.options import ChosenCamera, IntrinsicsSource, Locali
 from mapless_server.method.rejection import PoseHypothesis, Rejection
 from mapless_server.store import SceneAttributes
 
-from .queries import enum_from_message, enum_to_message, message_of
+from .enums import enum_from_message, enum_to_message, message_of
 from .radii import Conditions, ReportedRadii, reported_radii
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,12 +34,11 @@ from .answers import (
     result_to_rejection,
     set_used_intrinsics,
 )
+from .enums import enum_to_message, message_of
 from .queries import (
     MAX_CANDIDATES,
     MAX_REFERENCES,
     check_capture_time,
-    enum_to_message,
-    message_of,
     needs_attributes,
     options_from_message,
     photo_from_message,
@@ -48,6 +48,7 @@ from .queries import (
     with_depth,
 )
 from .radii import ReportedRadii
+from .uncertainty import uncertain_options
 
 if TYPE_CHECKING:
     from mapless_server.engine.groups import GroupResult
@@ -97,7 +98,7 @@ def queries_from_message(
                 photo=with_depth(photo, message, path, engine.image_limits),
                 narrowing=narrowing,
                 reference_count=count,
-                options=options,
+                options=uncertain_options(options, message, photo, path),
                 rerank=reranks and bool(message.references),
                 priors=priors,
                 is_part=True,
@@ -161,6 +162,28 @@ def session_poses_from_message(request: pb.LocalizeSequenceRequest) -> tuple[Axe
     axes = axes_from_message(request.options)
     poses = poses_from_message(request.frames, "frames", "session_from_camera")
     return axes, tuple(pose_from(axes, pose) for pose in poses)
+
+
+def with_tracked_motion(
+    queries: Sequence[Query], request: pb.LocalizeSequenceRequest, session_from_camera: Sequence[RigidTransform]
+) -> tuple[Query, ...]:
+    """The queries of a sequence's frames; with a rolling shutter they have how cameras moved, by tracked poses."""
+    shutters = [it.options.shutter for it in queries]
+    if not any(shutters):
+        return tuple(queries)
+    from mapless_server.method.groups.velocity import tracked_motions  # services do not load what computes
+
+    has_time = [it.HasField("capture_time") for it in request.frames]
+    first = next((it.capture_time.seconds for it in request.frames if it.HasField("capture_time")), 0)
+    times = [
+        it.capture_time.seconds - first + 1e-9 * it.capture_time.nanos if known else math.nan
+        for it, known in zip(request.frames, has_time, strict=True)
+    ]
+    motions = tracked_motions(session_from_camera, times, shutters, request.estimate_session_scale)
+    return tuple(
+        replace(it, options=replace(it.options, shutter=shutter and replace(shutter, tracked=motion)))
+        for it, shutter, motion in zip(queries, shutters, motions, strict=True)
+    )
 
 
 def session_from_rig_from_message(request: pb.LocalizeRigRequest) -> RigidTransform | None:

@@ -7,13 +7,9 @@ world here; no other module handles latitudes.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from enum import Enum
-from functools import cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
-from google.protobuf.descriptor import FieldDescriptor
-from google.protobuf.message import Message
 
 from mapless import names, wire
 from mapless.depth import depth_from_message
@@ -31,7 +27,6 @@ from mapless_server.method.bundle.priors import (
     NO_PRIORS,
     GravityPrior,
     HeadingPrior,
-    IntrinsicsSigma,
     PosePrior,
     PositionPrior,
     Priors,
@@ -43,42 +38,11 @@ from mapless_server.scenes import ANYWHERE, Cone, Narrowing, Sphere
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
+from .enums import enum_from_message
+from .uncertainty import uncertain_options
+
 FIRST_TIME_S, LAST_TIME_S = -62_135_596_800, 253_402_300_799
 """Range of google.protobuf.Timestamp."""
-
-E = TypeVar("E", bound=Enum)
-MessageT = TypeVar("MessageT", bound=Message)
-
-
-@cache
-def enum_to_message(value: Enum, enum: wire.ProtoEnum) -> Any:
-    """The protobuf number of a value."""
-    return enum.Value(wire.enum_prefix(enum) + value.name)
-
-
-def message_of(value: object, kind: type[MessageT], **others: Any) -> MessageT:
-    """The message of a value whose attributes have the names of the message's fields, all but `others`.
-
-    Enums are converted by their names; None leaves a field empty. AttributeError if the value lacks an attribute.
-    """
-    descriptor: Any = kind.DESCRIPTOR  # annotated as None
-    given = {it: getattr(value, it.name) for it in descriptor.fields if it.name not in others}
-    fields = {it.name: _number_of(found, it) if isinstance(found, Enum) else found for it, found in given.items()}
-    return kind(**fields, **others)
-
-
-def _number_of(value: Enum, field: FieldDescriptor) -> int:
-    values = field.enum_type.values
-    return int(next(it.number for it in values if it.name == values[0].name.removesuffix("UNSPECIFIED") + value.name))
-
-
-def enum_from_message(number: int, enum: wire.ProtoEnum, default: E, field: str) -> E:
-    """The value of a protobuf number, and the default for 0; FieldError if the number is unknown."""
-    if number == 0:
-        return default
-    if number not in enum.values():
-        raise FieldError(field, f"must be one of {enum.DESCRIPTOR.name}'s values, is {number}")
-    return type(default)[enum.Name(number).removeprefix(wire.enum_prefix(enum))]
 
 
 def scene_key_from_name(name: str, field: str, tenant: str) -> SceneKey:
@@ -172,9 +136,6 @@ MIN_SEEN_SHARE = 0.1
 """Least share of an image that a lens must show: a fisheye's circle shows 0.3 at least; wrong coefficients may show
 nothing."""
 
-LEAST_SIGMA = 1e-6
-"""Least standard deviation of intrinsics, as a share: they are exact, and their inverse squares are finite."""
-
 MAX_REFERENCES = 64
 MAX_CANDIDATES = 1000
 """References that a request may name where the server chooses among them."""
@@ -199,7 +160,7 @@ def query_from_message(
         photo=photo,
         narrowing=narrowing,
         reference_count=reference_count_from_message(request.options),
-        options=options_from_message(request.options, engine.coverage, _sigma_from(request, photo)),
+        options=uncertain_options(options_from_message(request.options, engine.coverage), request, photo, ""),
         allow_coarse=request.options.allow_coarse,
         rerank=request.options.rerank_references and bool(request.references),
         priors=priors,
@@ -217,28 +178,6 @@ def check_capture_time(message: Any) -> None:
         raise FieldError("capture_time", f"must be a time of the years 1 to 9999, since 1970, {given}")
 
 
-def _sigma_from(request: pb.LocalizeRequest, photo: Photo) -> IntrinsicsSigma | None:
-    """Reads standard deviations of the intrinsics; None for the defaults. FieldError names a wrong field."""
-    if not request.HasField("intrinsics_uncertainty"):
-        return None
-    if photo.exif is not None:
-        raise FieldError("intrinsics_uncertainty", "is that of intrinsics, and there are none")
-    message, camera, defaults = request.intrinsics_uncertainty, photo.camera, IntrinsicsSigma()
-
-    def share(name: str, default: float, whole: float) -> float:
-        value = getattr(message, name)
-        if not 0 <= value <= whole:
-            field = f"intrinsics_uncertainty.{name}"
-            raise FieldError(field, f"must be above 0 and at most {whole:g}, or 0 for the default, is {value:g}")
-        return max(value / whole, LEAST_SIGMA) if value else default
-
-    return IntrinsicsSigma(
-        share("focal_sigma_px", defaults.focal_share, camera.focal_x_px),
-        share("principal_sigma_px", defaults.principal_share, camera.width_px),
-        share("k1_sigma", defaults.k1, 1.0),
-    )
-
-
 def reference_count_from_message(message: pb.LocalizeOptions) -> int:
     """Number of references to choose if none is named."""
     count = message.reference_count
@@ -247,9 +186,7 @@ def reference_count_from_message(message: pb.LocalizeOptions) -> int:
     return count or DEFAULT_REFERENCE_COUNT
 
 
-def options_from_message(
-    message: pb.LocalizeOptions, coverage: float, intrinsics: IntrinsicsSigma | None = None
-) -> LocalizeOptions:
+def options_from_message(message: pb.LocalizeOptions, coverage: float) -> LocalizeOptions:
     """Reads the options of the method, with the server's default `coverage`; FieldError names a wrong field."""
     if not 0 <= message.coverage < 1:
         raise FieldError("options.coverage", f"must be above 0 and below 1, or 0, is {message.coverage:g}")
@@ -260,7 +197,6 @@ def options_from_message(
             message.scale_strategy, pb.ScaleStrategy, defaults.scale_strategy, "options.scale_strategy"
         ),
         coverage=message.coverage or coverage,
-        intrinsics=intrinsics,
     )
 
 

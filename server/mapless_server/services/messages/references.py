@@ -24,7 +24,7 @@ from mapless.wire import FieldError, joined
 from mapless_server.scenes import Choice, ReferenceAudit
 from mapless_server.store import ContradictingDown, DatumWithoutMetres, ReferenceRecord, SceneAttributes, SceneRecord
 
-from .queries import message_of
+from .enums import message_of
 
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000
