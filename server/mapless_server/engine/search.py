@@ -15,7 +15,7 @@ from mapless_server.method.judge.hypothesis import Attempt, Where, first_attempt
 from mapless_server.method.options import ChosenCamera, StageContext
 from mapless_server.method.rejection import PoseHypothesis
 from mapless_server.scenes import Choice
-from mapless_server.scenes.later import Pending
+from mapless_server.scenes.later import CALIBRATION, Pending
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
 from mapless_server.store import SceneAttributes, SceneState
 
@@ -235,8 +235,8 @@ class Search:
     @property
     def ends_s(self) -> float:
         """Time by which it ends: its deadline, or earlier where references lack something for a further attempt."""
-        lacks = self.found and (self.context.lacking or self.pending)
-        return min(self.deadline_s, self.begun_s + LACKING_S) if lacks else self.deadline_s
+        lacks = self.context.lacking or any(it.work != CALIBRATION for it in self.pending or ())
+        return min(self.deadline_s, self.begun_s + LACKING_S) if self.found and lacks else self.deadline_s
 
     @property
     def missing(self) -> tuple[MissingEvidence, ...]:

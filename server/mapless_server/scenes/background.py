@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from mapless_server.bounds import check_bounds
+from mapless_server.cache import LruCache
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.features.matching import StoredPair
 from mapless_server.method.features.views import PosedView
@@ -29,7 +30,7 @@ from mapless_server.store.pairs import CLAIM_S, Claim, Pair, PairStore, Progress
 from .calibration.calibrator import SceneCalibrations
 from .depth.scene_depths import SceneDepths
 from .indexes import SceneIndexes
-from .later import LaterFeatures, Pending, Work, in_order, name_of, what_of
+from .later import CALIBRATION, LaterFeatures, Pending, Work, in_order, name_of, what_of
 from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
 from .retrieval.ranking import rank_beside
@@ -44,6 +45,8 @@ _CACHE_BYTES = 64 * 2**20
 _WAITING_IS_COUNTED_S = 30.0
 _USE_IS_RECORDED_S = 3600.0
 _LOOK_S = 0.01
+_COMPLETE_SCENES = 10_000
+"""Scenes of which is remembered in which generation nothing was left."""
 _LONGEST_END_S = 10.0
 
 
@@ -131,6 +134,7 @@ class BackgroundMatching:
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._makes_pairs = False
+        self._complete: LruCache[int] = LruCache(_COMPLETE_SCENES)
         self._step_begin_s = 0.0
         self._busy_s = -math.inf
         self._use_is_due_s = -math.inf
@@ -211,12 +215,18 @@ class BackgroundMatching:
         """The work that is left in a scene, in order; empty if nothing is done in the background."""
         if self._thread is None or not self._makes_pairs:
             return []
+        generation = self._store.get_generation(scene_key)
+        if self._complete.get(scene_key) == generation:  # counting takes long in a large scene
+            return []
         counts = self._pairs.count_complete(scene_key, self._progress)
         total = counts[""]
         left = [Pending(what_of(it), name_of(it), total - counts[it.name]) for it in self._all]
         if self._calibrations is not None and self._calibrations.is_waiting(scene_key):
-            left.append(Pending("calibration", self._calibrations.kind, total))
-        return [it for it in left if it.reference_count > 0]
+            left.append(Pending(CALIBRATION, self._calibrations.kind, total))
+        left = [it for it in left if it.reference_count > 0]
+        if not left:
+            self._complete.put(scene_key, generation, 1)
+        return left
 
     def maintain(self) -> None:
         """Deletes damaged pairs and those of unused matchings, at most once an hour."""

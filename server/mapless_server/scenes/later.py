@@ -41,12 +41,16 @@ Work = TierMatching | LaterFeatures
 """One kind of work on each reference."""
 
 
+FEATURES, MATCHES, CALIBRATION = "features", "matches", "calibration"
+"""Kinds of work, for `Pending`."""
+
+
 @dataclass(frozen=True)
 class Pending:
     """Work that is left to the background in a scene.
 
     Attributes:
-        work: "features", "matches" of references with one another, or "calibration".
+        work: `FEATURES`, `MATCHES` of references with one another, or `CALIBRATION` of the scene.
         name: the features, for matches with how they are made; the kind of answers that is calibrated.
         reference_count: number of references that wait for it.
     """
@@ -58,7 +62,7 @@ class Pending:
 
 def what_of(work: Work) -> str:
     """What is made, for `Pending`."""
-    return "features" if isinstance(work, LaterFeatures) else "matches"
+    return FEATURES if isinstance(work, LaterFeatures) else MATCHES
 
 
 def name_of(work: Work) -> str:
