@@ -98,7 +98,7 @@ def _scene_card(scene: Scene) -> list[str]:
         labels=_labels(scene) or None,
         calibration=f"measured with {calibration.query_count} photographs" if calibration else None,
         created=_minute(scene),
-        pending="; ".join(map(str, scene.pending_work)) or None,
+        background=f"still makes {'; '.join(map(str, scene.pending_work))}" if scene.pending_work else None,
     )
 
 

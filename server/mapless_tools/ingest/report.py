@@ -141,12 +141,20 @@ def print_report(report: ImportReport, console: Console) -> None:
     if report.untried_count:
         counts.append(f"{report.untried_count} not reached")
     console.print(f"scene {report.scene}: {', '.join(counts)}", markup=False, highlight=False)
-    for it in report.pending:
-        console.print(f"left to the server's background: {it}", markup=False, highlight=False)
+    if left := left_to_do(report.pending):
+        console.print(f"left to the server's background: {left}", markup=False, highlight=False)
     if report.stopped:
         console.print(f"stopped: {report.stopped}", markup=False, highlight=False)
         if report.added:
             console.print("what is in stays in; the same command goes on from there", markup=False)
+
+
+def left_to_do(pending: Sequence[PendingWork]) -> str:
+    """Says for each kind of work how many references wait for some of it; empty if nothing is left."""
+    most = dict[str, int]()
+    for it in pending:
+        most[it.kind] = max(most.get(it.kind, 0), it.reference_count)
+    return ", ".join(f"{kind} of {count} references" for kind, count in most.items())
 
 
 def to_json(report: ImportReport) -> dict[str, Any]:
