@@ -13,7 +13,7 @@ from functools import partial
 
 from mapless_server.engine.photo_views import RasterForm
 from mapless_server.engine.search import Material
-from mapless_server.errors import NotFound, Unavailable
+from mapless_server.errors import NotFound, RequestError, Unavailable
 from mapless_server.method import ladder, pipeline
 from mapless_server.method.bundle.estimate import Support
 from mapless_server.method.judge.answer import Answer, Localization
@@ -161,7 +161,10 @@ class QueryStages:
         if isinstance(failure, FeaturesMissing):  # which the library makes after the call
             features = self._verdicts.tier(search.attempt).features
             return self._skipped(search.cut(search.rung, features, CutReason.FEATURES_MISSING), "unfinished")
-        log.warning("the attempt %r failed; the answer before it is given", search.rung, exc_info=failure)
+        unexpected = None if isinstance(failure, RequestError) else failure
+        log.warning(
+            "the attempt %r failed: %s; the answer before it is given", search.rung, failure, exc_info=unexpected
+        )
         is_full = failure_of(failure) is Failure.OUT_OF_MEMORY
         reason = CutReason.OUT_OF_MEMORY if is_full else CutReason.FAILED
         return self._unfinished(search, reason.value, reason)
