@@ -125,6 +125,20 @@ def test_upright_is_what_viewers_show(orientation: int) -> None:
     np.testing.assert_array_equal(np.rot90(unmirrored, -round(found.clockwise_deg / 90)), shown)
 
 
+@pytest.mark.parametrize("options", [{}, {"progressive": True}, {"comment": b"c" * 60_000}, {"restart_marker_rows": 1}])
+def test_pillow_is_not_asked_where_a_jpeg_has_no_segment_for_exif(
+    options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exif, plain, turned = Image.Exif(), io.BytesIO(), io.BytesIO()
+    exif[ExifTags.Base.Orientation] = 6
+    picture = Image.fromarray(textured(40, 30))
+    picture.save(plain, "JPEG", **options)
+    picture.save(turned, "JPEG", exif=exif, **options)
+    assert upright_of(turned.getvalue()) == Upright(clockwise_deg=90.0)
+    monkeypatch.setattr(Image, "open", None)
+    assert (upright_of(plain.getvalue()), read_exif(plain.getvalue())) == (Upright(), NO_EXIF)
+
+
 @pytest.mark.parametrize("ending", [".png", ".webp"])
 def test_all_formats_say_which_way_is_up(ending: str) -> None:
     exif, out = Image.Exif(), io.BytesIO()

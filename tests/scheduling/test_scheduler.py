@@ -134,6 +134,17 @@ class TestAdmission:
         run_through(toy)
         np.testing.assert_allclose(quota.settled, [(0.6, 0.0), (0.6, 0.6)])
 
+    def test_a_tenant_whose_time_is_spent_is_refused_before_its_message(self) -> None:
+        """Asking whether there is room costs nothing; a job of the server's own has no tenant."""
+        quota = PlantedQuota(admitted=2)
+        toy = Toy(quota=quota)
+        job = toy.admit()
+        toy.scheduler.check_room(job.flow, job.step, toy.now_s)
+        np.testing.assert_allclose(quota.settled, [(0.6, 0.0)])
+        with pytest.raises(Refused, match="computing time is used up"):
+            toy.scheduler.check_room(job.flow, job.step, toy.now_s)
+        toy.scheduler.check_room(Flow("", "the server's own"), job.step, toy.now_s)
+
     def test_jobs_that_fail_together_are_counted_and_paid_back(self) -> None:
         quota = PlantedQuota()
         toy = Toy(quota=quota)

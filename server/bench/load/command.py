@@ -129,7 +129,7 @@ def _refusals(quick: bool, output: Path) -> list[Check]:
     from .refusals import RefusalOptions, measure_refusals, refusal_checks, refusal_lines
     from .report import report_part
 
-    options = RefusalOptions(calls=20, rounds=1) if quick else RefusalOptions()
+    options = RefusalOptions(rounds=1) if quick else RefusalOptions()
     with _measuring() as progress:
         found = measure_refusals(options, progress)
     checks = refusal_checks(found)

@@ -2,6 +2,7 @@
 
 import asyncio
 import signal
+import sys
 from typing import Any
 
 import grpc
@@ -15,7 +16,7 @@ SHORT_BYTES = 300
 """Length of the answers of `Short`: about that of an answer of the server that computes nothing."""
 
 
-async def main() -> None:
+async def main(max_message_bytes: int) -> None:
     """Listens on a free port and serves until SIGTERM."""
 
     async def echo(data: bytes, _: object) -> bytes:
@@ -29,7 +30,7 @@ async def main() -> None:
 
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
-    server = grpc.aio.server(options=[("grpc.max_receive_message_length", MAX_MESSAGE_BYTES)])
+    server = grpc.aio.server(options=[("grpc.max_receive_message_length", max_message_bytes)])
     service, _, _ = ECHO_METHOD[1:].partition("/")
     methods = {"Echo": grpc.unary_unary_rpc_method_handler(echo), "Short": grpc.unary_unary_rpc_method_handler(short)}
     methods["Refused"] = grpc.stream_unary_rpc_method_handler(refused)  # whose message is not read
@@ -42,4 +43,4 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(main())
+    asyncio.run(main(int(sys.argv[1]) if sys.argv[1:] else MAX_MESSAGE_BYTES))

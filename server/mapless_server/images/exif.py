@@ -38,6 +38,8 @@ _DAMAGED = (
 _MAX_TEXT = 200
 _MAX_BYTES = 2**16
 """EXIF fits into a segment of a JPEG. A PNG or WebP may have more: 1.5 MB of tags take 0.9 s, this at most 0.1 s."""
+_APP1, _SCAN = 0xE1, 0xDA
+_SEGMENTS = {*range(0xC0, 0xD0), *range(0xDA, 0xFF)}  # markers of a JPEG that a length follows
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 _FILM_MM = (5.0, 1000.0)
 _FOCAL_MM = (0.5, 10_000.0)
@@ -141,12 +143,27 @@ def upright_of(image: bytes) -> Upright:
 
 def _tags(image: bytes) -> Image.Exif:
     """The tags of a file; those of a PNG are read only where they precede the pixels, which would be decoded."""
+    if _is_plain_jpeg(image):
+        return Image.Exif()
     with Image.open(io.BytesIO(image), formats=_FORMATS) as opened:
         if opened.format == "PNG" and "exif" not in opened.info:
             return Image.Exif()
         if len(opened.info.get("exif", b"")) > _MAX_BYTES:
             return Image.Exif()
         return opened.getexif()
+
+
+def _is_plain_jpeg(image: bytes) -> bool:
+    """Whether a JPEG has no segment APP1, where EXIF and XMP are, before its pixels; Pillow takes 30 times as long."""
+    position = 2
+    while image.startswith(b"\xff\xd8") and position + 4 <= len(image) and image[position] == 0xFF:
+        kind, length = image[position + 1], int.from_bytes(image[position + 2 : position + 4], "big")
+        if kind == _SCAN:
+            return True
+        if kind == _APP1 or kind not in _SEGMENTS or length < 2:
+            return False
+        position += 2 + length
+    return False
 
 
 def exif_of(tags: Image.Exif) -> Exif:

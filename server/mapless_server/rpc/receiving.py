@@ -65,9 +65,11 @@ class Receiver:
             Overloaded: the call was evicted.
             InvalidArgument: the caller sent no message, or a too large one (which grpc itself reports to the caller).
         """
+        if limit_s <= 0:
+            raise DeadlineExceeded("the message did not arrive in time", reason="MESSAGE_LATE")
         reading = self._reading.begin(context.read())
         awaited: set[asyncio.Future[Any]] = {reading} if evicted is None else {reading, evicted}
-        await asyncio.wait(awaited, timeout=max(0.0, limit_s), return_when=asyncio.FIRST_COMPLETED)
+        await asyncio.wait(awaited, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
         if not reading.done():
             if evicted is not None and evicted.done():
                 raise Overloaded("too many calls whose message has not arrived")

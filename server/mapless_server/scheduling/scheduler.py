@@ -137,11 +137,8 @@ class Scheduler:
         with self._refusals_reported(job.flow, now_s):
             self._admission.check(job, cost_s, now_s)
             # The server's own jobs have no tenant and are free; a job that continues others is charged when it ends.
-            if self._quota is not None and job.owner.tenant and not job.continues:
-                job.charged_s = cost_s.total()
-                wait_s = self._quota.charge(job.owner.tenant, job.owner.named_caller, job.charged_s, now_s)
-                if wait_s > 0:
-                    raise Refused(Refusal.TENANT_QUOTA, "the tenant's computing time is used up", wait_s)
+            if not job.continues:
+                job.charged_s = self._charged(job.owner, cost_s.total(), now_s)
         self._observer.admitted(cost_s.total())
         self._ledger.open(job, self._admission.bookable(cost_s))
         self._enqueue(job, cost_s.total(), now_s)
@@ -161,10 +158,22 @@ class Scheduler:
 
         That is a job as the caller's last one with this stage as its first, or with this step if there was none.
         """
-        flow = self.failing.queued_as(flow, now_s)
+        owner, flow = flow, self.failing.queued_as(flow, now_s)
         step = self._first_steps.last(flow, step)
         with self._refusals_reported(flow, now_s):
-            self._admission.check_queue(flow, self._stage_costs.of(step, flow, now_s))
+            cost_s = self._stage_costs.of(step, flow, now_s)
+            self._admission.check_queue(flow, cost_s)
+            if (charged_s := self._charged(owner, cost_s.total(), now_s)) and self._quota is not None:
+                self._quota.settle(owner.tenant, owner.named_caller, charged_s, 0.0, now_s)
+
+    def _charged(self, owner: Flow, cost_s: float, now_s: float) -> float:
+        """Charges a tenant with a predicted time and returns it; 0 for the server's own jobs, which have no tenant."""
+        if self._quota is None or not owner.tenant:
+            return 0.0
+        wait_s = self._quota.charge(owner.tenant, owner.named_caller, cost_s, now_s)
+        if wait_s > 0:
+            raise Refused(Refusal.TENANT_QUOTA, "the tenant's computing time is used up", wait_s)
+        return cost_s
 
     def has_work(self, lane_name: str, is_low: bool = False) -> bool:
         """Whether a job waits for an idle thread of a lane, of low priority or not."""

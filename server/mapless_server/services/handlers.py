@@ -50,11 +50,8 @@ _NEEDS_ROOM = {
 }
 """The methods whose messages are large and whose work waits in the queue, and whether they are queries."""
 
-
-_OF_STORE = frozenset(
-    f"/{SERVICE_NAMES[1]}/{name}"
-    for name in ("CreateScene", "ListScenes", "UpdateScene", "GetReference", "ListReferences", "UpdateReference")
-)
+_OF_STORE_ALONE = ("CreateScene", "ListScenes", "UpdateScene", "GetReference", "ListReferences")
+_OF_STORE = frozenset(f"/{SERVICE_NAMES[1]}/{name}" for name in _OF_STORE_ALONE)
 """The methods that need the store alone: they are answered while the server starts."""
 
 
