@@ -22,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..features.limits import MIN_INLIERS
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..structure.model import MetricScale
@@ -285,7 +286,9 @@ def _at_optimum(
     solved = Solved(given, problem, optimum(with_priors, start, options), used)
     before = replace(estimate, inliers=start_inliers, errors_px=errors_px)
     found = adjusted_estimate(solved, before, errors_of_pose(solved, terms))
-    return None if found is None else (_of_matches(found, count), solved)
+    found = found and _of_matches(found, count)
+    # The query's own points can hold a pose that hardly any of the others agree with.
+    return None if found is None or found.inliers.sum() < MIN_INLIERS else (found, solved)
 
 
 def intrinsics_terms(given: AdjustInput) -> IntrinsicsTerms:

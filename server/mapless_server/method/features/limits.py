@@ -20,3 +20,6 @@ INLIER_PX = 4.0
 
 INEXACT_INLIER_PX = 12.0
 """Largest reprojection error of a right match at a pose, or of a point, that is not exact yet."""
+
+MIN_INLIERS = 4
+"""Fewer inliers give no pose: any three agree with one."""

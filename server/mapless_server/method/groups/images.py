@@ -24,7 +24,7 @@ from mapless.geometry import Array, RigidTransform
 from ..bundle.estimate import PosedSupport, Support, observers
 from ..bundle.pose_problem import AdjustOptions
 from ..bundle.priors import NO_PRIORS, IntrinsicsSigma, Priors
-from ..features.limits import INLIER_PX
+from ..features.limits import INLIER_PX, MIN_INLIERS
 from ..judge.answer import Answer, Localization
 from ..judge.evidence import findable_count, hull_share
 from ..judge.references import moved_matches, without
@@ -34,7 +34,6 @@ from ..pairs.stationary import StationaryOptions
 from ..pose.generalized import CameraMatches
 from ..pose.own_depth import at_own_depth
 from ..pose.pnp import MIN_MATCHES, failure_by_chance, log10_false_alarms
-from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection, RejectionReason
 from ..structure.match import MatchOptions, search
 from ..structure.model import DepthPlanes, PointMatches, ScaleSource, Structure

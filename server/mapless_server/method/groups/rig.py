@@ -12,11 +12,11 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
 from ..bundle.priors import PriorCheck
+from ..features.limits import MIN_INLIERS
 from ..optim.optimize import covariance_in_world, perturbed
 from ..options import LocalizeOptions
 from ..pose.generalized import inlier_count, rig_ransac
 from ..pose.pnp import PnpOptions
-from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection, RejectionReason
 from .images import (
     GroupImage,

@@ -17,10 +17,9 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import PriorCheck, Priors
-from ..features.limits import INEXACT_INLIER_PX
+from ..features.limits import INEXACT_INLIER_PX, MIN_INLIERS
 from ..optim.optimize import covariance_in_world
 from ..options import LocalizeOptions
-from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection, RejectionReason
 from .drift import SequenceState, world_from_session_at
 from .images import (

@@ -13,11 +13,10 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, Similarity
 
 from ..bundle.priors import Priors
-from ..features.limits import INEXACT_INLIER_PX
+from ..features.limits import INEXACT_INLIER_PX, MIN_INLIERS
 from ..judge.evidence import PNP as QUICK_PNP
 from ..pose.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from ..pose.pnp import PnpOptions
-from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .drift import world_from_session_at
 from .images import MatchedImage

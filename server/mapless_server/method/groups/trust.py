@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 
+from ..features.limits import MIN_INLIERS
 from ..judge.evidence import (
     NO_AGREEMENT,
     PNP,
@@ -29,7 +30,6 @@ from ..judge.evidence import (
 from ..judge.judge import JudgeOptions, low_trust, trust_of
 from ..judge.references import Supporters, disagreeing_references
 from ..pose.generalized import CameraMatches, rig_ransac
-from ..pose.with_priors import MIN_INLIERS
 from ..rejection import Rejection
 from .images import PosedImage
 

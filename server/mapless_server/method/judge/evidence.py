@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.estimate import PosedSupport, Support
-from ..features.limits import EPIPOLAR_PX, LOSS_SCALE_PX
+from ..features.limits import EPIPOLAR_PX, LOSS_SCALE_PX, MIN_INLIERS
 from ..features.tracks import keypoint_offsets
 from ..features.views import Matches, PosedView, View
 from ..optim.optimize import LEAST_DAMPING, cauchy_weight, pose_jacobian
 from ..pose.pnp import PnpOptions, ransac
 from ..pose.two_view_matches import TwoViewMatches
-from ..pose.with_priors import MIN_INLIERS
 from ..structure.model import PixelPoints, PointMatches, Structure
 
 MOST_POINTS = 2000

@@ -21,12 +21,12 @@ from mapless_server.bounds import check_bounds
 
 from ..bundle.estimate import PoseEstimate, PoseStage
 from ..bundle.priors import NO_PRIORS, Priors
-from ..features.limits import INLIER_PX, LOSS_SCALE_PX
+from ..features.limits import INLIER_PX, LOSS_SCALE_PX, MIN_INLIERS
 from ..features.views import View
 from ..optim.optimize import pose_hessian, world_covariance
 from ..rejection import Rejection, RejectionReason
 from ..structure.model import PixelPoints, PointMatches, Structure
-from .with_priors import MIN_INLIERS, informed_pose
+from .with_priors import informed_pose
 
 SAMPLE, SAMPLE_INLIERS, SAMPLE_ITERATIONS = 80, 32, 300
 """Matches that RANSAC sees first, the least inliers among them, and the largest number of iterations: so many find a

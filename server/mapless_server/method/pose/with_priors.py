@@ -24,6 +24,7 @@ from mapless.geometry import Array, RigidTransform
 
 from ..bundle.pose_problem import AdjustOptions
 from ..bundle.priors import NO_PRIORS, GravityPrior, PriorCheck, Priors
+from ..features.limits import MIN_INLIERS
 from ..optim.optimize import (
     MinimizeOptions,
     cauchy_cost,
@@ -44,9 +45,6 @@ PRIOR_WEIGHT = AdjustOptions.error_inflation**2
 
 STEPS = MinimizeOptions(iterations=10, min_decrease=1e-4)
 """Steps of a refinement with priors."""
-
-MIN_INLIERS = 4
-"""Fewer inliers give no pose: any three agree with one."""
 
 ENOUGH_INLIERS = 50
 """With so many no candidates from priors are tried: more than repeated structure gives a wrong pose."""
