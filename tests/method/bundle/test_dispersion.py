@@ -72,6 +72,8 @@ def test_steps_equal_those_of_the_dense_equations(references: int) -> None:
         matrix[-6:, -6:] += LEAST_LEFT * np.linalg.inv(covariance)
         expected = -np.linalg.solve(matrix, pull)[-6:] - offset
         np.testing.assert_allclose(found.references[i], expected, atol=1e-3 * np.abs(found.references).max())
+    np.testing.assert_allclose(found.modelled, covariance, atol=1e-3 * np.abs(covariance).max())
+    assert found.observing_count == references
 
 
 def test_the_gap_is_that_to_the_nearest_reference() -> None:
@@ -95,7 +97,7 @@ def test_covariance_of_three_poses_equals_the_jackknife() -> None:
     references, regions = np.zeros((3, 6)), np.zeros((4, 6))
     references[:, 0], references[:, 4] = [1, 2, 6], [0, 3, 0]
     regions[:, 0] = [1, -1, 2, -2]
-    covariance = Dispersion(references, regions, np.zeros(6), 0.1, NO_INTRINSICS).covariance(3.0)
+    covariance = Dispersion(references, regions, np.zeros(6), np.eye(6), 3, 0.1, NO_INTRINSICS).covariance(3.0)
     assert covariance[0, 0] == pytest.approx(2 / 3 * (4 + 1 + 9) + 9 * 10)
     assert covariance[4, 4] == pytest.approx(2 / 3 * (1 + 4 + 1))
     assert covariance[0, 4] == pytest.approx(2 / 3 * (2 - 2 - 3))

@@ -28,6 +28,15 @@ inference with multiway clustering, 2011):
 Both are of the pose as it is estimated: by the normal equations of the adjustment at its optimum (see `bundle`), where
 the references may move and far ones are held less, and of which each q_(i) is one Newton step.
 
+With K references the jackknife has K - 1 degrees of freedom: two that agree by chance, or because each without the
+other determines little, have a small dispersion. So it is shrunk towards the covariance by the normal equations C_n,
+whose noise and errors of poses are those that the residuals between the references show (see `pose_problem`),
+
+    C = ((K - 1) (C_r + C_p) + v C_n) / (K - 1 + v),
+
+the posterior mean of a covariance whose prior (inverse Wishart) is worth v references. It falls with the number of
+references as C_n does, and is the dispersion where there are many.
+
 What all matches share (one lens model, one survey) shows in neither, and what neighbouring references share in part:
 where the references' errors drift, errors are larger than stated. Keypoints move with the viewpoint, for all references
 to the same side: errors grow more than radii with the gap (see `estimate`), by which both are enlarged. Factors on the
@@ -81,6 +90,8 @@ class UncertaintyOptions:
             is both in the references' part and in that of the regions. Evidence: radii.
         gap_growth: exponent of the gap in the factor on standard deviations. Larger ones make radii of the closest
             references too small.
+        modelled_freedom: v, the references that the covariance by the normal equations is worth. Evidence:
+            few-references.
         max_matches: largest number of the photograph's matches, evenly thinned; the time is linear in it.
     """
 
@@ -88,11 +99,12 @@ class UncertaintyOptions:
     position_factor: float = 0.76
     rotation_factor: float = 0.78
     gap_growth: float = 0.1
+    modelled_freedom: float = 1.0
     max_matches: int = 500
 
     def __post_init__(self) -> None:
         check_bounds(self, "region_factor position_factor rotation_factor max_matches", above=0)
-        check_bounds(self, "gap_growth", at_least=0)
+        check_bounds(self, "gap_growth modelled_freedom", at_least=0)
 
 
 LEAST_EIGENVALUE = 1e-7
@@ -117,6 +129,8 @@ class Dispersion:
         references: (K, 6) change of the optimum without each reference's observations.
         regions: (G, 6) influence of the matches in each region of the photograph.
         offset: (6,) the Gauss-Newton step from the pose to the optimum.
+        modelled: (6, 6) covariance by the normal equations, as if the modelled errors were all.
+        observing_count: number of references that observe the points.
         gap: distance to the nearest reference that holds the pose, over the median depth of the points.
         intrinsics: evidence of the data about errors of the intrinsics; empty if the problem has not these unknowns.
         depths: (K, 6) motion by one standard deviation of the factor that a reference's depths share; empty without.
@@ -125,6 +139,8 @@ class Dispersion:
     references: Array
     regions: Array
     offset: Array
+    modelled: Array
+    observing_count: int
     gap: float
     intrinsics: IntrinsicsEquations
     depths: Array = field(default_factory=lambda: np.zeros((0, 6)))
@@ -183,8 +199,16 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
         thinning * influences[:, 6:],
         world_jacobian(bundle.world_from_query) @ -solved[0, query, :-1],
     )
-    depths = _by_depths(seen, to_pose, points)
-    return Dispersion(poses[1:] - poses[0], influences[:, :6], poses[0], _gap(seen, bundle), intrinsics, depths)
+    return Dispersion(
+        poses[1:] - poses[0],
+        influences[:, :6],
+        poses[0],
+        to_pose[:, query] / thinning,
+        len(observing) - 1,
+        _gap(seen, bundle),
+        intrinsics,
+        _by_depths(seen, to_pose, points),
+    )
 
 
 def dispersed_covariance(
@@ -194,16 +218,19 @@ def dispersed_covariance(
 
     `is_offset` is whether the pose is known not to be at the optimum.
     """
-    grown = gap_ratio(dispersion.gap) ** (2 * options.gap_growth)
-    covariance = grown * dispersion.covariance(options.region_factor)
-    if is_offset:
-        covariance = covariance + np.outer(dispersion.offset, dispersion.offset)
     factor, jacobian = (
         np.repeat([options.position_factor, options.rotation_factor], 3),
         world_jacobian(world_from_camera),
     )
     to_world = factor[:, None] * jacobian
-    covariance = to_world @ covariance @ to_world.T
+    grown = gap_ratio(dispersion.gap) ** (2 * options.gap_growth)
+    dispersed = to_world @ (grown * dispersion.covariance(options.region_factor)) @ to_world.T
+    modelled = jacobian @ dispersion.modelled @ jacobian.T
+    freedom, prior = max(dispersion.observing_count - 1, 0), options.modelled_freedom
+    covariance = (freedom * dispersed + prior * modelled) / (freedom + prior)
+    if is_offset:
+        offset = to_world @ dispersion.offset
+        covariance = covariance + np.outer(offset, offset)
     if len(dispersion.depths):
         by_depths = dispersion.depths @ jacobian.T
         covariance = covariance + by_depths.T @ by_depths

@@ -58,6 +58,12 @@ MIN_NOISE_LEVEL_PX = 0.15
 """Least noise of a keypoint, pixels: that of the residuals in surveyed scenes under good light."""
 
 
+LEAST_OBSERVATIONS = 30
+"""Fewer do not determine the level of the noise."""
+MEDIAN_NORMAL = 0.6745
+"""Median size of a normal number of standard deviation one."""
+
+
 @dataclass(frozen=True, eq=False)
 class Observations:
     """Observations of points by references; column o is one observation.
@@ -204,16 +210,20 @@ def adjust_points(observations: Observations, x_in_world: Array, loss_scale_sigm
 def estimate_noise(observations: Observations, x_in_world: Array, noise: KeypointNoise) -> KeypointNoise:
     """Returns `noise`, which the observations were weighted with, at the level estimated from their residuals.
 
-    Uses points with three or more observations; fewer than 30 observations leave the level as it is. The median length
-    of a two-dimensional normal residual is sqrt(2 ln 2) sigma; a point takes 3 of its 2 n degrees of freedom, so
-    residuals are too small by sqrt(1 - 1.5 / n).
+    Uses points with three or more observations, or those with two, if the others have fewer than 30 observations; fewer
+    than 30 of these leave the level as it is. The median length of a two-dimensional normal residual is
+    sqrt(2 ln 2) sigma; a point takes 3 of its 2 n degrees of freedom, so residuals are too small by sqrt(1 - 1.5 / n).
+    Two observations are both off by half of their distance from the epipolar line, which has one degree of freedom.
     """
     count = observations.tracks.length
     length_px = length(observations.residuals(x_in_world).T) * observations.sigma_px
-    used = (count >= 3) & np.isfinite(length_px)
-    if used.sum() < 30:
+    is_known = np.isfinite(length_px)
+    used, by_count = (count >= 3) & is_known, np.sqrt(2 * np.log(2) * (1 - 1.5 / count))
+    if used.sum() < LEAST_OBSERVATIONS:
+        used, by_count = (count == 2) & is_known, np.full(len(count), MEDIAN_NORMAL / np.sqrt(2))
+    if used.sum() < LEAST_OBSERVATIONS:
         return noise
-    observed_px = np.median(length_px[used] / (1 - 1.5 / count[used]) ** 0.5) / np.sqrt(2 * np.log(2))
+    observed_px = np.median(length_px[used] / by_count[used])
     by_size_squared = np.median(observations.sigma_px[used] ** 2 - noise.level_px**2)
     return replace(noise, level_px=float(max(observed_px**2 - by_size_squared, MIN_NOISE_LEVEL_PX**2) ** 0.5))
 
