@@ -28,7 +28,7 @@ from mapless_server.method.pairs import pair as reference_pairs
 from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.pair import Matching, in_order
 from mapless_server.scenes import background
-from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions
+from mapless_server.scenes.background import BackgroundMatching, BackgroundOptions, SceneWork
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
@@ -84,6 +84,7 @@ class Server:
         kinds: Sequence[Matching] = TWO,
         strong_matching: PairMatching | None = None,
         enough_matches: int = 500,
+        work: SceneWork | None = None,
     ) -> None:
         self.store, self.counts = store, Counts()
         self.matcher = Matcher(
@@ -95,7 +96,7 @@ class Server:
         self.library = ReferenceLibrary(store)
         indexes = SceneIndexes(store, self.library, DESCRIPTOR, EXTRACTOR, 2**30)
         matchings = {TierMatching(EXTRACTOR, self.matcher, kind): self.finder for kind in kinds}
-        self.background = BackgroundMatching(store, indexes, matchings, is_idle, self.counts, options=options)
+        self.background = BackgroundMatching(store, indexes, matchings, is_idle, self.counts, work, options)
 
     def references(self) -> tuple[PosedView, ...]:
         ids = self.store.list_reference_ids(SCENE, 100)
@@ -461,6 +462,39 @@ class TestPriority:
         finally:
             server.background.close()
         assert (server.counts.made, len(server.stored())) == (0, 0)
+
+    def test_a_first_calibration_precedes_matches_and_yields_to_callers(
+        self, store: Store, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """It waits for no idle time: the server must only compute for no caller at that moment."""
+        is_busy, done = threading.Event(), list[str]()
+
+        class Stages:
+            def calibrate_next(self, pause: Callable[[], None], is_first: bool = False) -> bool:
+                if not is_first or done:
+                    return False
+                pause()
+                done.append(f"calibrated with {server.counts.made} pairs")
+                return True
+
+            def maintain(self) -> None:
+                pass
+
+            kind = "a kind"
+
+        options = BackgroundOptions(poll_s=0.01, busy_share=1e-6, quiet_s=60.0)
+        calibrations: Any = Stages()
+        server = Server(store, options, lambda: not is_busy.is_set(), work=SceneWork(calibrations))
+        is_busy.set()
+        server.background.start()
+        try:
+            assert not threading.Event().wait(0.3)
+            assert not done
+            is_busy.clear()
+            wait_until(lambda: bool(done))
+        finally:
+            server.background.close()
+        assert done == ["calibrated with 0 pairs"]
 
     def test_a_busy_server_with_slow_pairs_ends_too(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         """The wait for its share would be longer than a claim holds."""

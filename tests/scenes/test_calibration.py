@@ -15,12 +15,12 @@ from support.stores import Folder, Place, let_pass
 
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.errors import Unavailable
-from mapless_server.method.bundle.estimate import USUAL_GAP, Accuracy, growth
+from mapless_server.method.bundle.estimate import SELF_TAIL_95, TAIL_95, USUAL_GAP, Accuracy, growth
 from mapless_server.method.bundle.intrinsics import corrected_view
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.judge import LEVELS, trust_in_scene
 from mapless_server.method.pipeline import Pipeline
-from mapless_server.scenes.calibration.calibrator import MAX_CPU_S, Calibrator, SceneCalibrations
+from mapless_server.scenes.calibration.calibrator import FIRST_SAMPLE, MAX_CPU_S, Calibrator, SceneCalibrations
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut, fit
 from mapless_server.scenes.calibration.lens import SharedErrors, lens_contradiction, without_errors
 from mapless_server.scenes.indexes import SceneIndexes
@@ -66,8 +66,13 @@ class TestFit:
         n0 = (options.scatter / options.factor_log) ** 2
         assert np.log(found.position_factor) == pytest.approx(count / (count + n0) * np.log(factor), abs=0.05)
 
+    def test_few_answers_leave_wider_radii(self) -> None:
+        tails = [fit(spread(count, 1.0), KIND, 7).position_tail for count in (3, 10, 100, 3000)]
+        assert tails == sorted(tails, reverse=True)
+        assert tails[-1] == pytest.approx(SELF_TAIL_95 / TAIL_95, rel=0.02)
+
     def test_a_larger_gap_explains_larger_errors(self) -> None:
-        near, far = (fit(spread(30, 2.0, gap), KIND, 1) for gap in (0.05, 0.4))
+        near, far = (fit(spread(30, 2.0, gap), KIND, 1, FitOptions(noise_share=0.01)) for gap in (0.05, 0.4))
         assert near.position_factor == pytest.approx(far.position_factor, rel=0.03)
 
     def test_errors_that_do_not_shrink_are_of_the_references(self) -> None:
@@ -286,6 +291,18 @@ class TestServers:
         assert found is not None
         assert found.generation == store.get_generation(SCENE)
         assert first.counts.waits == 0
+
+    def test_calibrate_first_from_few_references(self, store: Store) -> None:
+        add(store, REFERENCES)
+        server = Server(store)
+        assert server.calibrations.calibrate_next(lambda: None, is_first=True)
+        few = store.get_attributes(SCENE).self_calibration(KIND)
+        assert few is not None
+        assert 3 <= few.answer_count <= FIRST_SAMPLE
+        assert not server.calibrations.calibrate_next(lambda: None, is_first=True)
+        all_of_them = server.run()
+        assert all_of_them is not None
+        assert (server.counts.calibrated, all_of_them.generation) == (2, few.generation)
 
     def test_that_are_closed_leave_the_scene_to_others(self, store: Store) -> None:
         add(store, REFERENCES[:4])

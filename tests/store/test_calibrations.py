@@ -67,6 +67,35 @@ def test_a_scene_is_due_after_each_change_alone(store: Store) -> None:
     assert store.get_attributes(OFFICE).self_calibration(KIND) is not None  # the last one until then
 
 
+def test_a_first_calibration_leaves_the_scene_due(store: Store) -> None:
+    assert claim_scene(store.database, KIND, is_first=True) is None  # two references
+    store.add_references(OFFICE, [make_reference("c", 3)])
+    first = claim_scene(store.database, KIND, is_first=True)
+    assert first is not None
+    found = of(store)
+    assert add(store, first, found, 0.0, is_first=True)
+    assert store.get_attributes(OFFICE).self_calibrations == (found,)
+    assert claim_scene(store.database, KIND, is_first=True) is None
+    assert claim_scene(store.database, KIND) is not None
+
+
+def test_a_first_calibration_is_made_again_when_a_scene_doubles(store: Store) -> None:
+    store.add_references(OFFICE, [make_reference("c", 3)])
+    begin = store.get_generation(OFFICE)
+    first = claim_scene(store.database, KIND, is_first=True)
+    assert first is not None
+    add(store, first, of(store), 0.0, is_first=True)
+    for i in range(begin):
+        assert claim_scene(store.database, KIND, is_first=True) is None
+        store.add_references(OFFICE, [make_reference(f"more-{i}", 4 + i)])
+    again = claim_scene(store.database, KIND, is_first=True)
+    assert again is not None
+    add(store, again, of(store), 0.0)
+    for i in range(2 * begin):
+        store.add_references(OFFICE, [make_reference(f"most-{i}", 40 + i)])
+    assert claim_scene(store.database, KIND, is_first=True) is None  # idle time does it
+
+
 def test_frequent_changes_do_not_keep_servers_busy(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     add(store, claimed(store), of(store), 100.0)
     store.delete_reference(OFFICE, "a")

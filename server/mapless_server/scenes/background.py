@@ -87,7 +87,8 @@ class SceneWork:
     """The work on scenes besides matches; None for work that is not done.
 
     Attributes:
-        calibrations: made when all references are matched; they use depths.
+        calibrations: the first of a scene is made from a few references before these are matched, the others when all
+            are; they use depths.
         depths: made before scenes are calibrated.
         features: further features of references.
         agreements: brought up to date after a scene's references are matched.
@@ -178,6 +179,10 @@ class BackgroundMatching:
         self._step_begin_s = time.monotonic()
         return self._depths is not None and self._depths.make_next(self._wait_for_callers)
 
+    def _calibrate_first(self) -> bool:
+        self._step_begin_s = time.monotonic()
+        return self._calibrations is not None and self._calibrations.calibrate_next(self._yield_to_callers, True)
+
     def _calibrate_next(self) -> bool:
         self._step_begin_s = time.monotonic()
         return self._calibrations is not None and self._calibrations.calibrate_next(self._wait_for_callers)
@@ -264,7 +269,10 @@ class BackgroundMatching:
                 log.warning("matching references in the background failed, and is tried again: %s", error)
 
     def _claim(self, works: Sequence[Work]) -> tuple[Work, Claim] | None:
+        """Claims the next reference; before it, scenes get their first calibration."""
         self.maintain()
+        while self._calibrate_first():
+            pass
         for work in works:
             claim = self._pairs.claim(work.name, self._progress[work.name])
             if claim is not None:
@@ -375,22 +383,28 @@ class BackgroundMatching:
         self._check()
         self._let_callers_first()
 
+    def _yield_to_callers(self) -> None:
+        """Waits while the server computes for a caller, without waiting until it has been idle for a while."""
+        self._check()
+        self._let_callers_first(quiet_s=0.0)
+
     def _pause(self) -> None:
         """Pauses in the middle of a slow pair, which has about ten steps."""
         self._check()
         self._let_callers_first(1 / 30)
 
-    def _let_callers_first(self, share_of_claim: float = 1 / 4) -> None:
+    def _let_callers_first(self, share_of_claim: float = 1 / 4, quiet_s: float | None = None) -> None:
         """Ends a step: waits while the server computes for callers, as long as `busy_share` demands.
 
         It waits at most this share of the time that a claim holds, so that the claim does not end meanwhile.
         """
         options, now_s = self.options, time.monotonic()
+        quiet_s = options.quiet_s if quiet_s is None else quiet_s
         until_s = now_s + min((now_s - self._step_begin_s) / options.busy_share, CLAIM_S * share_of_claim)
         while now_s < until_s:
             if not self._is_idle():
                 self._busy_s = now_s
-            if now_s - self._busy_s >= options.quiet_s or self._closing.wait(_LOOK_S):
+            if (self._busy_s < now_s and now_s - self._busy_s >= quiet_s) or self._closing.wait(_LOOK_S):
                 break
             now_s = time.monotonic()
         self._step_begin_s = time.monotonic()

@@ -2,16 +2,18 @@
 
 There is one calibration for each *kind* of answers: features, backend and server version, see `calibration_kind`. It
 belongs to a generation of its scene; a later one makes the scene due again, and until then the last calibration is
-used. A server claims a scene, localizes its references and stores the result; a claim ends by itself after `CLAIM_S`
-unless it is renewed, so a scene whose server is killed is calibrated by another server, or after a restart. A server
-that lost its claim, because it was too slow or the scene was deleted, stores nothing.
+used. A first calibration, of a few references soon after they were added, leaves the scene due; it is made again when
+the scene's generation has doubled, until there is another one. A server claims a scene, localizes its references and
+stores the result; a claim ends by itself after `CLAIM_S` unless it is renewed, so a scene whose server is killed is
+calibrated by another server, or after a restart. A server that lost its claim, because it was too slow or the scene was
+deleted, stores nothing.
 """
 
 import random
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Select, delete, func, or_, select, update
+from sqlalchemy import ColumnElement, Connection, Select, and_, delete, func, or_, select, update
 
 from mapless_server.errors import NotFound
 from mapless_server.security import SceneKey
@@ -26,6 +28,9 @@ from .tables import reference, scene, scene_calibration, scene_generation
 
 CLAIM_S = 120.0
 """Far longer than one reference takes, also on a busy server; it is renewed after each."""
+
+LEAST_REFERENCES = 3
+"""A reference is localized against two others at least."""
 
 _CANDIDATES = 16
 
@@ -42,10 +47,14 @@ class CalibrationClaim:
     until_us: int
 
 
-def claim_scene(database: Database, kind: str) -> CalibrationClaim | None:
-    """Claims a scene that has changed since its calibration; None if none may be claimed now."""
+def claim_scene(database: Database, kind: str, is_first: bool = False) -> CalibrationClaim | None:
+    """Claims a scene that has changed since its calibration; None if none may be claimed now.
+
+    With `is_first` only one that has at most a first calibration, and twice as many references since.
+    """
+    select_due = _select_first(kind) if is_first else _select_due(kind)
     with database.read() as connection:
-        due = connection.execute(_select_due(kind).limit(_CANDIDATES)).all()
+        due = connection.execute(select_due.limit(_CANDIDATES)).all()
     for row in random.sample(due, len(due)):
         claim = CalibrationClaim(SceneKey(row.scene_id), kind, rows.now_us() + round(CLAIM_S * 1e6))
         with database.write() as connection:
@@ -77,16 +86,19 @@ def release(database: Database, claim: CalibrationClaim) -> None:
         connection.execute(_of(claim).values(due_time_us=rows.now_us()))
 
 
-def add(store: Store, claim: CalibrationClaim, calibration: SelfCalibration, wait_s: float) -> bool:
+def add(
+    store: Store, claim: CalibrationClaim, calibration: SelfCalibration, wait_s: float, is_first: bool = False
+) -> bool:
     """Stores the calibration of a claimed scene, and ends the claim; False if the claim was lost.
 
     It is not a change of the scene, but cached values of the scene are dropped. The scene may be calibrated again after
-    `wait_s`, however often it changes.
+    `wait_s`, however often it changes; a first calibration is stored as of its negative generation, and leaves it due.
     """
     data = codec.encode_calibration(calibration)
     sha256 = codec.sha256_for(rows.calibration_owner(claim.scene_key, claim.kind), data)
     due_us = rows.now_us() + round(wait_s * 1e6)
-    values = {"generation": calibration.generation, "data": data, "sha256": sha256, "due_time_us": due_us}
+    generation = -calibration.generation if is_first else calibration.generation
+    values = {"generation": generation, "data": data, "sha256": sha256, "due_time_us": due_us}
     with store.changing() as connection:
         return connection.execute(_of(claim).values(**values, failure_count=0)).rowcount == 1
 
@@ -142,6 +154,12 @@ def _select_changed(kind: str) -> Select[Any]:
 def _select_due(kind: str) -> Select[Any]:
     column = scene_calibration.c
     return _select_changed(kind).where(or_(column.due_time_us.is_(None), column.due_time_us <= rows.now_us()))
+
+
+def _select_first(kind: str) -> Select[Any]:
+    column, now = scene_calibration.c, scene_generation.c.generation
+    grown = or_(column.generation.is_(None), and_(column.generation < 0, now >= -2 * column.generation))
+    return _select_due(kind).where(grown, scene.c.reference_count >= LEAST_REFERENCES)
 
 
 def _try_claim(connection: Connection, claim: CalibrationClaim) -> bool:

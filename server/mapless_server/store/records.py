@@ -29,7 +29,7 @@ class DatumWithoutMetres(ValueError):
     """A scene has a datum, although its unit of length is not the metre."""
 
 
-CALIBRATION_MODEL = 4
+CALIBRATION_MODEL = 5
 """Raised whenever the same references would give another `SelfCalibration`, or answers use it in another way."""
 
 
@@ -47,6 +47,7 @@ class SelfCalibration:
         trust_quantiles: quantiles of the generic trust of right answers, at the levels of `method.judge.judge`; empty
             if unknown.
         lens: sentence about an error of the intrinsics that the references share; empty if they show none.
+        position_tail, rotation_tail: factors on the ratio of the radius of 95 % to that of 68 %.
     """
 
     kind: str
@@ -58,9 +59,11 @@ class SelfCalibration:
     reference_noise_deg: float = 0.0
     trust_quantiles: tuple[float, ...] = ()
     lens: str = ""
+    position_tail: float = 1.0
+    rotation_tail: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("position_factor", "rotation_factor"):
+        for name in ("position_factor", "rotation_factor", "position_tail", "rotation_tail"):
             factor = getattr(self, name)
             if not MIN_FACTOR <= factor <= MAX_FACTOR:
                 raise ValueError(f"{name} must be {MIN_FACTOR:g} to {MAX_FACTOR:g}, is {factor:g}")

@@ -31,6 +31,7 @@ MODULES = {
     "scene_agreement": ("scene-agreement",),
     "rungs": ("rungs",),
     "readings": ("readings", "suspects"),
+    "first_answers": ("few-references", "first-answers"),
     "depth_errors": ("depth-errors",),
     "rolling_shutter": ("rolling-shutter",),
     "depth_scores": ("depth-scores", "depth-radius"),

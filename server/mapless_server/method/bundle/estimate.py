@@ -225,11 +225,8 @@ TAIL_95 = HEAVY_TAIL
 """Factor on the radius of 95 %, for heavy tails; the covariance is right at 68 %. Evidence: radii."""
 
 SELF_TAIL_95 = 1.3
-"""The same for answers of a scene that is calibrated: the other one has to cover that scenes differ. Evidence:
-self-calibration."""
-
-TAIL_PRIOR = 5.0
-"""Number of a calibration's answers at which the factor is half-way between the two."""
+"""The same for answers of a scene that many answers calibrate: the other one has to cover that scenes differ. Evidence:
+first-answers."""
 
 
 @dataclass(frozen=True)
@@ -249,11 +246,6 @@ def accuracy_from_covariance(covariance: Array) -> Accuracy:
     rotation_68, rotation_95 = error_radii(covariance[3:, 3:], shares).tolist()
     radii_deg = math.degrees(rotation_68), TAIL_95 * math.degrees(rotation_95)
     return Accuracy(position_68_m, TAIL_95 * position_95_m, *radii_deg)
-
-
-def self_tail(count: int) -> float:
-    """Factor on the radius of 95 % in a scene that is calibrated by so many answers to its references."""
-    return float(TAIL_95 * (SELF_TAIL_95 / TAIL_95) ** (count / (count + TAIL_PRIOR)))
 
 
 JACKKNIFE_SHARE = 0.6

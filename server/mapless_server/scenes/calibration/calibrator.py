@@ -25,6 +25,7 @@ from mapless_server.security import SceneKey
 from mapless_server.store import SelfCalibration, Store
 from mapless_server.store.calibrations import (
     CLAIM_S,
+    LEAST_REFERENCES,
     CalibrationClaim,
     add,
     claim_scene,
@@ -50,6 +51,8 @@ from .lens import LENS_REFERENCES, SharedErrors, lens_contradiction, shared_erro
 log = logging.getLogger(__name__)
 
 
+FIRST_SAMPLE = 8
+"""References that the first calibration localizes, before there is idle time. Evidence: first-answers."""
 SAMPLE = 40
 """Largest number of references of a scene that are localized against the others."""
 MAX_CPU_S = 8.5
@@ -85,18 +88,23 @@ class Calibrator:
         newest: Sequence[str],
         pause: Callable[[], None],
         contradicts_itself: bool = False,
+        count: int = SAMPLE,
     ) -> SelfCalibration:
-        """Localizes references of a scene, and fits the model to the results.
+        """Localizes so many references of a scene, and fits the model to the results.
 
         `newest` are ids of its latest references, the latest first; `pause` is called between the stages of each, and
-        may raise, which ends it. In a scene that `contradicts_itself` none are localized: its poses measure nothing.
+        may raise, which ends it. Of fewer than `LENS_REFERENCES` no errors of the lens are sought. In a scene that
+        `contradicts_itself` none are localized: its poses measure nothing.
         NotFound if there is no such scene (field "scene").
         """
         context = StageContext(pause)
         entries = self._indexes.entries(scene_key, context)
-        sample = [] if contradicts_itself else self._sample(entries, newest)
+        sample = [] if contradicts_itself else self._sample(entries, newest, count)
         shared: list[SharedErrors] = []
-        results = self._localize(scene_key, entries, library, sample, context, shared)
+        # Few references show errors of a lens that more of them do not.
+        results = self._localize(
+            scene_key, entries, library, sample, context, shared if count >= LENS_REFERENCES else None
+        )
         found, lens = fit(results, self.kind, entries.generation), lens_contradiction(shared)
         if lens is None:
             return found
@@ -129,16 +137,16 @@ class Calibrator:
             context.check()
         return results
 
-    def _sample(self, entries: Entries, newest: Sequence[str]) -> list[str]:
-        """Ids of references to leave out: the newest and the worst covered by turns."""
+    def _sample(self, entries: Entries, newest: Sequence[str], count: int) -> list[str]:
+        """Ids of so many references to leave out: the newest and the worst covered by turns."""
         rows = entries.rows()
-        if len(rows) < 3:  # two others are needed
+        if len(rows) < LEAST_REFERENCES:
             return []
         centres = entries.centres(rows)
         nearest_m = KDTree(centres).query(centres, k=2)[0][:, 1]
-        far = [entries.reference(rows[i])[0] for i in np.argsort(-nearest_m, kind="stable")[:SAMPLE]]
+        far = [entries.reference(rows[i])[0] for i in np.argsort(-nearest_m, kind="stable")[:count]]
         by_turns = chain.from_iterable(zip_longest([it for it in newest if it in entries], far))
-        return [it for it in dict.fromkeys(by_turns) if it is not None][:SAMPLE]
+        return [it for it in dict.fromkeys(by_turns) if it is not None][:count]
 
     def _leave_out(
         self,
@@ -241,18 +249,19 @@ class SceneCalibrations:
         """Whether a scene has changed since its calibration."""
         return is_waiting(self._store.database, scene_key, self.kind)
 
-    def calibrate_next(self, pause: Callable[[], None]) -> bool:
+    def calibrate_next(self, pause: Callable[[], None], is_first: bool = False) -> bool:
         """Calibrates one scene that may be claimed now; returns False if there is none. Raises if the store fails.
 
-        `pause` is called in the middle of the work; it may raise, which ends it.
+        With `is_first` one without a calibration, or with a first one and twice as many references since, from a few of
+        its references. `pause` is called in the middle of the work; it may raise, which ends it.
         """
         database = self._store.database
-        claim = claim_scene(database, self.kind)
+        claim = claim_scene(database, self.kind, is_first)
         self._observer.waiting("calibration_waiting", count_waiting(database, self.kind))
         if claim is None:
             return False
         with suppress(_Lost, NotFound):
-            self._calibrate(claim, pause)
+            self._calibrate(claim, pause, is_first)
         return True
 
     def maintain(self) -> None:
@@ -261,7 +270,7 @@ class SceneCalibrations:
         if count:
             log.error("%d damaged calibrations of scenes are made again", count)
 
-    def _calibrate(self, claim: CalibrationClaim, pause: Callable[[], None]) -> None:
+    def _calibrate(self, claim: CalibrationClaim, pause: Callable[[], None], is_first: bool) -> None:
         """Calibrates one scene, or postpones it if that fails."""
         held = [claim]
 
@@ -275,7 +284,7 @@ class SceneCalibrations:
 
         begin_s = time.thread_time()
         try:
-            found = self._localize_references(claim, renew_and_pause)
+            found = self._localize_references(claim, renew_and_pause, FIRST_SAMPLE if is_first else SAMPLE)
         except (_Lost, NotFound):
             raise
         except Closed:
@@ -285,17 +294,18 @@ class SceneCalibrations:
             self._report_failure(held[0], error)
             return
         cpu_s = time.thread_time() - begin_s
-        if add(self._store, held[0], found, max(LEAST_WAIT_S, WAIT_BY_CPU * cpu_s)):
+        wait_s = 0.0 if is_first else max(LEAST_WAIT_S, WAIT_BY_CPU * cpu_s)
+        if add(self._store, held[0], found, wait_s, is_first):
             self._observer.count("calibrations")
             self._observer.count("calibration_cpu_seconds", cpu_s)
             log.info("scene %s is calibrated from %d of its references", claim.scene_key, found.answer_count)
 
-    def _localize_references(self, claim: CalibrationClaim, pause: Callable[[], None]) -> SelfCalibration:
+    def _localize_references(self, claim: CalibrationClaim, pause: Callable[[], None], count: int) -> SelfCalibration:
         newest = list_newest(self._store.database, claim.scene_key, SAMPLE)
         # Of its own, so that references that queries use stay in memory.
         with closing(ReferenceLibrary(self._store.uncached(_CACHE_BYTES), self._depths)) as library:
             is_wrong = self._agreements is not None and self._agreements.known(claim.scene_key).contradicts_itself
-            return self._calibrator.calibrate(claim.scene_key, library, newest, pause, is_wrong)
+            return self._calibrator.calibrate(claim.scene_key, library, newest, pause, is_wrong, count)
 
     def _report_failure(self, claim: CalibrationClaim, error: Exception) -> None:
         wait_s = postpone(self._store.database, claim)

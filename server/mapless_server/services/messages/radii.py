@@ -8,7 +8,7 @@ import numpy as np
 
 from mapless.geometry import Array
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration
-from mapless_server.method.bundle.estimate import TAIL_95, USUAL_GAP, Accuracy, growth, self_tail
+from mapless_server.method.bundle.estimate import USUAL_GAP, Accuracy, growth
 from mapless_server.method.options import Variant
 from mapless_server.store import SceneAttributes, SelfCalibration
 
@@ -60,12 +60,11 @@ class Conditions:
 
 def calibration_of(found: SelfCalibration, conditions: Conditions) -> Calibration:
     """The calibration that a fit to at least one answer gives for answers computed under these conditions."""
-    tail = self_tail(found.answer_count) / TAIL_95
     return Calibration(
         found.position_factor,
-        _bounded(tail * found.position_factor),
+        _bounded(found.position_tail * found.position_factor),
         found.rotation_factor,
-        _bounded(tail * found.rotation_factor),
+        _bounded(found.rotation_tail * found.rotation_factor),
         found.answer_count,
         **asdict(conditions),
         reference_noise_m=found.reference_noise_m,
