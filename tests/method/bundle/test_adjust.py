@@ -213,6 +213,23 @@ def test_keypoints_without_a_point_are_no_inliers_of_the_answer() -> None:
     assert np.trace(after.covariance[:3, :3]) < np.trace(before.covariance[:3, :3])
 
 
+def test_a_pose_that_own_points_alone_hold_is_not_used() -> None:
+    """The matches with points are all off by six pixels; too few agree with the pose of the others."""
+    scene = make_scene(random_for("own alone"), MANY_POINTS)
+    structure, matches, _ = stages(scene, scene.references)
+    few = np.arange(len(structure.x_in_world)) < 8
+    kept = few[matches.point]
+    structure = replace(structure, x_in_world=structure.x_in_world[few], tracks=structure.tracks.select(few))
+    matches = PointMatches(matches.point[kept], matches.keypoint[kept], matches.guided[kept], 0.0)
+    keypoints = scene.query.features.keypoints.copy()
+    keypoints[matches.keypoint] += np.float32([6.0, 0.0])
+    query = replace(scene.query, features=replace(scene.query.features, keypoints=keypoints))
+    estimate = cheated_estimate(scene, matches, scene.world_from_query, error_px=1.0)
+    others = [it[~np.isin(it[:, 0], matches.keypoint)] for it in true_correspondences(scene).query_matches]
+    given = AdjustInput(query, scene.references, structure, matches, AdjustOptions(), query_matches=others)
+    assert adjust_pose(given, estimate).inliers.all()
+
+
 def test_few_keypoints_without_a_point_change_nothing() -> None:
     before, after, _ = with_few_points("most", 230)
     np.testing.assert_array_equal(after.world_from_camera.matrix(), before.world_from_camera.matrix())
