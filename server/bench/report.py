@@ -25,7 +25,15 @@ from mapless_tools.evaluate.report import (
     format_stages,
     to_json,
 )
-from mapless_tools.evaluate.run import SCENE, Evaluation, Plan, localize_queries, plan_for, store_references
+from mapless_tools.evaluate.run import (
+    SCENE,
+    Evaluation,
+    Plan,
+    await_features,
+    localize_queries,
+    plan_for,
+    store_references,
+)
 from mapless_tools.output_files import markdown_table
 from mapless_tools.progress import Progress
 
@@ -59,6 +67,7 @@ def measure_latency(
         data_dir = Path(folder)
         with child_server(data_dir) as server, Client(server.address, CONNECT) as client:
             store_references(client, SCENE, plan.references, progress)
+            await_features(client, SCENE, progress)
         cold = [_first_call_ms(data_dir, plan, options, i + 1) for i in range(cold_count - 1)]
         with child_server(data_dir) as server, Client(server.address, CONNECT) as client:
             client.is_serving()

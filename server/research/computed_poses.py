@@ -20,6 +20,7 @@ from mapless.geometry import Camera
 from mapless_tools.child import temporary_server
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.evaluate.run import await_features
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.ingest.metres import umeyama
 from mapless_tools.output_files import markdown_table
@@ -71,6 +72,7 @@ def localized(
     client.create_scene(scene, arbitrary_unit=not metric)
     new = [NewReference(it.name, it.image_path, it.camera, it.world_from_camera) for it in references]
     client.add_references(scene, new)
+    await_features(client, scene)
     errors = {}
     for frame, camera in queries:
         answer = client.localize(frame.image_path.read_bytes(), camera, scene)

@@ -52,6 +52,7 @@ from mapless_server.store import NewReference, Store
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.ingest.formats.cameras import read_folder
+from research.all_features import describe_all
 
 WRONG_SHARE = 0.05
 MIN_VISIBLE = 0.5
@@ -293,7 +294,7 @@ class DepthPlace:
 
     async def _add(self) -> None:
         photos = [Photo(it.image_path.read_bytes(), it.camera, "image") for it in self.frames]
-        described = await self._engine.describe(photos, _caller())
+        described = describe_all(self._engine, photos)
         for scene in (WITH, WITHOUT):
             self._store.create_scene(scene)
             self._store.add_references(

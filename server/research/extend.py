@@ -20,6 +20,7 @@ from mapless.provenance import GIVEN_POSE, PLACED
 from mapless_tools.child import temporary_server
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.evaluate.run import await_features
 from mapless_tools.extend.existing import KnownPicture
 from mapless_tools.extend.options import ExtendOptions
 from mapless_tools.extend.placing import Placed
@@ -94,6 +95,7 @@ def compared(scenes: Scenes, found: Sequence[Placed]) -> list[str]:
             scene = name.replace(" ", "-")
             client.create_scene(scene)
             client.add_references(scene, its)
+            await_features(client, scene)
             rows.append([name, *localized(client, scene, queries, [it.reference_id for it in its])])
     return markdown_table("scene | localized | median | rotation | largest | within 95 %", rows)
 

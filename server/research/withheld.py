@@ -20,6 +20,7 @@ from mapless import Client, LocalizationResult, NewReference, Rejected
 from mapless.geometry import Camera, RigidTransform
 from mapless_tools.child import temporary_server
 from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.evaluate.run import await_features
 
 from .places import Scenes, distance_seen, is_right, spread
 
@@ -78,6 +79,7 @@ def asked(client: Client, scenes: Scenes, name: str) -> Iterator[Asked]:
     client.create_scene(scene, arbitrary_unit=not dataset.metric)
     new = [NewReference(it.name, it.image_path, it.camera, it.world_from_camera) for it in frames]
     client.add_references(scene, new)
+    await_features(client, scene)
     for frame in spread(frames[1:-1], QUERIES):
         others = [it.name for it in frames if it is not frame]
         image = frame.image_path.read_bytes()

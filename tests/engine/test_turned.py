@@ -15,7 +15,6 @@ import pytest
 from numpy.typing import NDArray
 from support.compare import pose_error
 from support.corner import CAMERA, photograph, pose
-from support.described import describe_all
 from support.images import encode, textured, with_exif_orientation
 
 from mapless.geometry import Camera, RigidTransform
@@ -41,6 +40,7 @@ from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
 from mapless_server.store import NewReference, Store
+from research.all_features import describe_all
 
 SCENE = SceneKey("corner")
 TRUE = pose(2.0, -1.5)

@@ -110,5 +110,5 @@ def test_matches_of_first_features_precede_later_ones() -> None:
     wide = TierMatching(first.extractor, first.matcher, Matching.WIDE)
     own, strong = LaterFeatures(StandInExtractor("any roll"), object()), LaterFeatures(later.extractor)  # type: ignore[arg-type]
     urgent, others = in_order([first, wide, later], [strong, own])
-    assert urgent == [first, own, wide]
-    assert others == [strong, later]
+    assert urgent == [first, own, strong, wide]
+    assert others == [later]

@@ -26,7 +26,7 @@ from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import Parts, engine_over
 from mapless_server.store import Store
-from support.described import describe_all
+from research.all_features import describe_all
 from support.servers import CAMERA, PHOTO, StandInDescriptor, StandInExtractor, StandInReconstructor, pose, whole
 
 SURE_INLIERS, DOUBTFUL_INLIERS = 500, 5

@@ -279,6 +279,7 @@ class TestMeasure:
 
         monkeypatch.setattr(suite_module, "temporary_server", nullcontext)
         monkeypatch.setattr(suite_module, "store_references", lambda *_: None)
+        monkeypatch.setattr(suite_module, "await_features", lambda *_: None)
         monkeypatch.setattr(suite_module, "localize_query", localize)
         planned = suite({"chess": 0.01}, options)
         setup = RunSetup(options, Matcher.of(Settings()), planned.provenance, folder, lambda *_: None)

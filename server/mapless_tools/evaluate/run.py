@@ -21,6 +21,8 @@ from .references import Matcher, PlannedQuery, check_images, rank_by_matches
 
 SCENE = "evaluation"
 
+_LOOK_S = 1.0
+
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -51,6 +53,7 @@ def evaluate(dataset: Dataset, options: EvaluationOptions, settings: Settings, p
     plan = plan_for(dataset, options, settings, progress)
     with temporary_server() as client:
         store_references(client, SCENE, plan.references, progress)
+        await_features(client, SCENE, progress)
         results = localize_queries(client, plan, options, progress)
     radius = trajectory_radius(np.array([f.world_from_camera.translation for f in plan.references]))
     return Evaluation(dataset, options, len(plan.references), radius, results)
@@ -78,6 +81,20 @@ def store_references(client: Client, scene: str, references: Sequence[Frame], pr
     total = len(references)
     progress("storing references", 0, total)
     client.add_references(scene, new, on_progress=lambda done: progress("storing references", done, total))
+
+
+def await_features(client: Client, scene: str, progress: Progress = lambda *_: None) -> None:
+    """Waits until the server has found the features that doubtful photographs need: their answers depend on them."""
+    total = 0
+    while True:
+        pending = client.get_scene(scene).pending_work
+        left = max((it.reference_count for it in pending if it.kind == "features"), default=0)
+        total = max(total, left)
+        if total:
+            progress("finding further features", total - left, total)
+        if not left:
+            return
+        time.sleep(_LOOK_S)
 
 
 def localize_queries(

@@ -30,7 +30,7 @@ from .benchmarks import ScenePlace
 from .metrics import EarlierAnswer, QueryResult
 from .plan import EvaluationOptions, Method, SceneSplit, SuiteOptions, setting_name
 from .references import Matcher, Pairs, PlannedQuery, paired, rank_by_matches
-from .run import localize_query, store_references
+from .run import await_features, localize_query, store_references
 
 
 @dataclass(frozen=True)
@@ -294,6 +294,7 @@ def _measure_setting(client: Client, split: SceneSplit, runs: Sequence[Run], set
     progress = labelled(setup.progress, f"{scene.place.name}, {setting_name(split.setting)}")
     planned = _with_references(scene, split, setup, progress)
     store_references(client, scene_id, split.references, progress)
+    await_features(client, scene_id, progress)
     references = {frame.name: frame.world_from_camera for frame in split.references}
     for run in runs:
         options = EvaluationOptions(k=setup.options.k, variant=run.method.variant, scale_strategy=run.method.scale)

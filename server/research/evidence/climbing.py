@@ -26,6 +26,7 @@ from mapless_server.settings import load_settings
 from mapless_server.store import NewReference, SceneAttributes, Store
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
+from research.all_features import describe_all
 from research.places import Place, Scenes, is_right, own_and_other
 
 ALL = EngineOptions(doubt=DoubtOptions(promise=PromiseOptions(least_gain_per_s=0.0)), workers=1)
@@ -74,7 +75,7 @@ def _asked(folder: str, place: Place, own: Sequence[Frame], others: Sequence[Fra
 
 async def _store(engine: QueueEngine, store: Store, place: Place) -> None:
     photos = [Photo(it.image_path.read_bytes(), it.camera, "image") for it in place.reference_frames]
-    described = await engine.describe(photos, _caller())
+    described = describe_all(engine, photos)
     store.create_scene(SCENE, SceneAttributes(arbitrary_unit=not place.dataset.metric))
     frames = zip(place.reference_frames, photos, described, strict=True)
     references = [

@@ -2,7 +2,6 @@
 
 import asyncio
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -11,11 +10,10 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import Caller, Description, Photo
+from mapless_server.engine.query import Description, Photo
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.images import ImageLimits
 from mapless_server.scenes.agreement import Agreement
-from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.serve.assembly import engine_over
 from mapless_server.serve.features import make_tiers
@@ -23,6 +21,7 @@ from mapless_server.settings import load_settings
 from mapless_server.store import NewReference, SceneAttributes, Store
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.formats.cameras import read_folder
+from research.all_features import describe_all
 from research.places import spread
 
 from .page import Measurement, Row
@@ -48,8 +47,7 @@ def _rows(folder: Path) -> Iterator[Row]:
         with closing(loop), tempfile.TemporaryDirectory() as place, Store.open(Path(place), 2**28) as store:
             engine = engine_over(store, make_tiers(settings), options)
             photos = [Photo(it.image_path.read_bytes(), it.camera, "image") for it in frames]
-            caller = Caller(Flow("tenant", "client"), time.monotonic() + 600)
-            described = loop.run_until_complete(engine.describe(photos, caller))
+            described = describe_all(engine, photos)
             for reading, change in READINGS.items():
                 is_millimetres = reading == "millimetres"
                 if is_millimetres and not dataset.metric:

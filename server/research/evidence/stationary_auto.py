@@ -9,6 +9,7 @@ import numpy as np
 from mapless import Camera, Client, NewReference, Rejected, RigidTransform
 from mapless_tools.child import temporary_server
 from mapless_tools.evaluate.metrics import pose_error
+from mapless_tools.evaluate.run import await_features
 from research.places import RIGHT_M
 
 from .overlays import OVERLAYS, Image, Overlay
@@ -37,6 +38,7 @@ def _asked(client: Client, scene: Scene, overlay: Overlay) -> Row:
         for i, it in enumerate(scene.references)
     ]
     client.add_references(identifier, references)
+    await_features(client, identifier)
     others = [
         _pose(client, _encoded(it, overlay, 500 + 31 * i), camera, identifier) for i, it in enumerate(scene.others)
     ]
