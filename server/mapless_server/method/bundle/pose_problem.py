@@ -160,7 +160,9 @@ class AdjustInput:
     def with_points(self, used: NDArray[np.intp], points: Array) -> "AdjustInput":
         """Moves the points of the `used` matches to `points` (P, 3), in the order of the structure."""
         x_in_world = self.structure.x_in_world.copy()
-        x_in_world[np.unique(self.matches.point[used])] = points
+        chosen = np.zeros(len(x_in_world), bool)
+        chosen[self.matches.point[used]] = True
+        x_in_world[chosen] = points
         return replace(self, structure=replace(self.structure, x_in_world=x_in_world))
 
 
@@ -204,7 +206,7 @@ def pose_problem(
     if known is not None:
         return replace(problem, information=known[0]), problem.at(replace(start, poses=known[1]))
     centres = np.array([it.world_from_camera.translation for it in references])
-    observing = np.unique(tracks.view)[:-1]  # the last is the query
+    observing = np.flatnonzero(np.bincount(tracks.view))[:-1]  # the last is the query
     focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
     centre, level_px, rotations = world_from_query.translation, structure.noise.level_px, problem.given.rotation
     stated = [it.provenance.accuracy for it in references]

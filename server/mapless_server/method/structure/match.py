@@ -103,8 +103,9 @@ def search(
     projected = query.camera.project(world_from_query.inverse().apply(structure.x_in_world))
     size = np.array([query.camera.width_px, query.camera.height_px])
     inside = ((projected > -options.radius_px) & (projected < size + options.radius_px)).all(axis=1)
-    free_points = np.setdiff1d(np.flatnonzero(inside), known.point)
-    free_keypoints = np.setdiff1d(np.arange(len(keypoints)), known.keypoint)
+    is_free = np.ones(len(keypoints), bool)
+    inside[known.point] = is_free[known.keypoint] = False
+    free_points, free_keypoints = np.flatnonzero(inside), np.flatnonzero(is_free)
     near = KDTree(projected[free_points]).sparse_distance_matrix(
         KDTree(keypoints[free_keypoints]), options.radius_px, output_type="ndarray"
     )
