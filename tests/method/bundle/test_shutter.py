@@ -15,7 +15,7 @@ from mapless.lenses import RadialTangential
 from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance
 from mapless_server.method.bundle.priors import NO_PRIORS
 from mapless_server.method.bundle.readout import ReadoutDirection, RollingShutter, TrackedMotion
-from mapless_server.method.bundle.shutter import MotionPrior, row_times, without_motion
+from mapless_server.method.bundle.shutter import MotionPrior, row_times, still_view, without_motion
 from mapless_server.method.features.views import Features, View, undistort_pixels
 from mapless_server.method.localize import localize
 from mapless_server.method.optim.optimize import perturbed, rotation_vector
@@ -137,3 +137,16 @@ def test_unseen_motion_is_in_the_covariance_by_its_prior() -> None:
         both = np.concatenate([shift, turn]) / 0.05
         variance += np.outer(both, both)
     np.testing.assert_allclose(added, variance, atol=0.05 * np.abs(variance).max())
+
+
+def test_a_wrong_match_beside_the_camera_does_not_hide_a_motion() -> None:
+    motion = np.array(MOTIONS["pan"])
+    moving = read_by_rows(SCENE, motion)
+    structure, matches, estimate = stages(moving, moving.references)
+    seen = matches.seen(moving.query, structure.x_in_world)
+    beside = estimate.world_from_camera.apply(np.array([[0.5, 0.3, 1e-3]]))
+    seen = replace(seen, x_in_world=np.concatenate([beside, seen.x_in_world[1:]]))
+    tracked = replace(SHUTTER, tracked=TrackedMotion((0, 0, -0.05, 0, 0, 0), 0.5, 0.5))
+    for shutter in (SHUTTER, tracked):
+        still = still_view(moving.query, seen, matches.keypoint, estimate.world_from_camera, shutter)
+        assert np.abs(still.motion - motion)[3:].max() < 0.005

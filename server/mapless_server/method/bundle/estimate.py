@@ -85,6 +85,8 @@ class PoseEstimate:
         view: the photograph's view with the intrinsics of the estimate, if it contradicts the given ones; else None.
         depth_check: how the photograph's depth compares with the pose; None without depth.
         depth_log10_chance: log10 of the chance that a wrong pose agrees with it so; above 0 if it contradicts the pose.
+        motion_covariance: (6, 6) the part of the covariance by the camera's motion during a rolling shutter's read-out;
+            None without one.
     """
 
     world_from_camera: RigidTransform
@@ -99,6 +101,7 @@ class PoseEstimate:
     view: View | None = None
     depth_check: DepthCheck | None = None
     depth_log10_chance: float = 0.0
+    motion_covariance: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

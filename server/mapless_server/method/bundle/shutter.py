@@ -64,6 +64,8 @@ STEPS = MinimizeOptions(iterations=8, min_decrease=1e-3)
 """Steps with each of these scales."""
 LEAST_MATCHES = 12
 """Fewer do not determine a pose and a motion: 24 equations for 12 unknowns."""
+LEAST_DEPTH = 0.1
+"""Least depth of a match, by the usual one: wrong ones beside the camera would be behind it after a small motion."""
 LEAST_SHIFT_PX = 0.25
 """A motion that moves no keypoint by so much is left to the adjustment, to which it is linear."""
 
@@ -154,11 +156,12 @@ def still_view(
     time = row_times(query, shutter)
     unmoved = StillView(query, time, np.zeros(6), start)
     depth = start.inverse().apply(seen.x_in_world)[:, 2]
-    front = np.flatnonzero(depth > 0)
-    near = front[seen[front].errors_px(start) < INEXACT_INLIER_PX]
-    if len(near) < LEAST_MATCHES:
+    near = seen.errors_px(start) < INEXACT_INLIER_PX
+    if near.sum() < LEAST_MATCHES:
         return unmoved
-    prior = MotionPrior.of(shutter, float(np.median(depth[near])))
+    distance_m = float(np.median(depth[near]))
+    front = np.flatnonzero(depth > LEAST_DEPTH * distance_m)
+    prior = MotionPrior.of(shutter, distance_m)
     pose, motion = _most_probable(seen[front], time[keypoint[front]], prior, start.inverse())
     x_in_camera = _at_times(pose.apply(seen.x_in_world[front]), time[keypoint[front]], motion)
     fits = np.linalg.norm(seen.camera.project(x_in_camera) - seen.pixels[front], axis=1) < INEXACT_INLIER_PX
@@ -206,11 +209,8 @@ def with_motion(
     off = motions - motion
     covariance = np.einsum("s,sij->ij", probability, covariances + off[:, :, None] * off[:, None])
     by_motion = equations.motion
-    return replace(
-        estimate,
-        world_from_camera=moved(estimate.world_from_camera, by_motion @ (motion - removed)),
-        covariance=estimate.covariance + by_motion @ covariance @ by_motion.T,
-    )
+    pose = moved(estimate.world_from_camera, by_motion @ (motion - removed))
+    return _with_covariance(replace(estimate, world_from_camera=pose), by_motion @ covariance @ by_motion.T)
 
 
 def without_motion(support: PosedSupport, time: Array, shutter: RollingShutter) -> PoseEstimate:
@@ -226,14 +226,19 @@ def without_motion(support: PosedSupport, time: Array, shutter: RollingShutter) 
     cross = np.einsum("aim,ajm->ij", by_pose, by_pose * time[keypoint])
     by_motion = world_jacobian(estimate.world_from_camera) @ -np.linalg.pinv(information, hermitian=True) @ cross
     spread = MotionPrior.of(shutter, support.distance_m()).spread
-    return replace(estimate, covariance=estimate.covariance + by_motion @ spread @ by_motion.T)
+    return _with_covariance(estimate, by_motion @ spread @ by_motion.T)
+
+
+def _with_covariance(estimate: PoseEstimate, by_motion: Array) -> PoseEstimate:
+    """The estimate whose covariance contains a part (6, 6) by the motion, too."""
+    return replace(estimate, covariance=estimate.covariance + by_motion, motion_covariance=by_motion)
 
 
 def _most_probable(
     seen: PixelPoints, time: Array, prior: MotionPrior, start: RigidTransform
 ) -> tuple[RigidTransform, Array]:
     """camera_from_world in the middle and the motion (6,), means over the parts of the prior."""
-    pose, motion = start, prior.share @ prior.mean
+    pose, motion = start, np.zeros(6)
     for scale_px in LOSS_SCALES_PX:
         problem = _Moving(seen, time, prior, scale_px)
         pose, motion = minimize(problem, (pose, motion), STEPS)

@@ -76,6 +76,8 @@ class MatchedImage(Support):
         own_trust: trust in `own_pose` if depths give it, whose evidence needs no second reference; else 0.
         own_count: number of its inliers.
         at_own_depth: (P,) which points have their distance from the photograph's own depth, at `own_pose`.
+        motion_covariance: (6, 6) the part of `own_covariance` by the camera's motion during a rolling shutter's
+            read-out; None without one.
     """
 
     image: int
@@ -85,6 +87,7 @@ class MatchedImage(Support):
     at_own_depth: NDArray[np.bool_]
     own_trust: float = 0.0
     own_count: int = 0
+    motion_covariance: Array | None = None
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
         """Returns the matches as pixels and points of a camera with this pose in the rig."""
@@ -221,6 +224,7 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
         at_own_depth=at_own_depth(support),
         own_trust=own_trust,
         own_count=own_count,
+        motion_covariance=support.estimate.motion_covariance if isinstance(support, PosedSupport) else None,
     )
 
 

@@ -112,8 +112,21 @@ def solve_rig(
     if doubt:
         return doubt
     world_from_rig = estimate.state.rig_from_world.inverse()
-    covariance = covariance_in_world(estimate.covariance, world_from_rig)
+    covariance = _with_motion(
+        covariance_in_world(estimate.covariance, world_from_rig), estimate.matched, world_from_rig
+    )
     return RigEstimate(world_from_rig.shifted(origin), covariance, estimate.matched, trust, estimate.prior_checks)
+
+
+def _with_motion(covariance: Array, matched: Sequence[PosedImage], world_from_rig: RigidTransform) -> Array:
+    """A rig's covariance (6, 6) with that of its motion while rolling shutters read, which is one for all cameras."""
+    by_motion = []
+    for it in matched:
+        if it.source.motion_covariance is not None:
+            to_rig = np.eye(6)
+            to_rig[:3, 3:] = -cross_matrix(world_from_rig.translation - it.world_from_camera.translation)
+            by_motion.append(to_rig @ it.source.motion_covariance @ to_rig.T)
+    return covariance + np.mean(by_motion, axis=0) if by_motion else covariance
 
 
 def _start(
