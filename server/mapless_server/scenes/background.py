@@ -87,8 +87,7 @@ class SceneWork:
     """The work on scenes besides matches; None for work that is not done.
 
     Attributes:
-        calibrations: the first of a scene is made from a few references before these are matched, the others when all
-            are; they use depths.
+        calibrations: the first of a scene is made before references are matched, others after it; they use depths.
         depths: made before scenes are calibrated.
         features: further features of references.
         agreements: brought up to date after a scene's references are matched.
@@ -179,13 +178,10 @@ class BackgroundMatching:
         self._step_begin_s = time.monotonic()
         return self._depths is not None and self._depths.make_next(self._wait_for_callers)
 
-    def _calibrate_first(self) -> bool:
+    def _calibrate_next(self, is_first: bool = False) -> bool:
         self._step_begin_s = time.monotonic()
-        return self._calibrations is not None and self._calibrations.calibrate_next(self._yield_to_callers, True)
-
-    def _calibrate_next(self) -> bool:
-        self._step_begin_s = time.monotonic()
-        return self._calibrations is not None and self._calibrations.calibrate_next(self._wait_for_callers)
+        pause = partial(self._wait_for_callers, 0.0 if is_first else None)  # the first needs no idle time
+        return self._calibrations is not None and self._calibrations.calibrate_next(pause, is_first)
 
     def match_waiting(self) -> None:
         """Does all work on references that may be claimed now, until none is left; raises if the store fails."""
@@ -271,7 +267,7 @@ class BackgroundMatching:
     def _claim(self, works: Sequence[Work]) -> tuple[Work, Claim] | None:
         """Claims the next reference; before it, scenes get their first calibration."""
         self.maintain()
-        while self._calibrate_first():
+        while self._calibrate_next(is_first=True):
             pass
         for work in works:
             claim = self._pairs.claim(work.name, self._progress[work.name])
@@ -379,14 +375,9 @@ class BackgroundMatching:
         if self._closing.is_set():
             raise Closed
 
-    def _wait_for_callers(self) -> None:
+    def _wait_for_callers(self, quiet_s: float | None = None) -> None:
         self._check()
-        self._let_callers_first()
-
-    def _yield_to_callers(self) -> None:
-        """Waits while the server computes for a caller, without waiting until it has been idle for a while."""
-        self._check()
-        self._let_callers_first(quiet_s=0.0)
+        self._let_callers_first(quiet_s=quiet_s)
 
     def _pause(self) -> None:
         """Pauses in the middle of a slow pair, which has about ten steps."""
