@@ -254,6 +254,8 @@ class Store(StoreReader):
         deleted; ValueError if the descriptor is not a vector, or a number is not finite as float16.
         """
         row = rows.descriptor_row(key, name, vector)
+        with self.database.read() as connection:  # one that is gone waits for no writer, which may be its deletion
+            queries.find_by_key(connection, key, tables.reference.c.scene_id)
         with self.changing() as connection:
             queries.lock_reference(connection, key)
             queries.insert_new(connection, tables.global_descriptor, row)
