@@ -4,6 +4,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -222,3 +223,21 @@ def test_a_reader_behind_the_kept_deletions_reads_all(place: Place, monkeypatch:
             assert contents(follower.known) == whole
         assert [it.wholes for it in followers] == [2] * 8 + [1] * 4
     assert faults_of(place) == ()
+
+
+def test_where_one_process_writes_only_a_change_asks_the_database(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Store.open(tmp_path) as store:
+        store.create_scene(OFFICE)
+        store.add_references(OFFICE, [described("a")])
+        now = store.list_changes(OFFICE, None, "vlad").generation
+        with monkeypatch.context() as patch:
+            patch.setattr(store.database, "read", None)
+            same = store.list_changes(OFFICE, now, "vlad")
+        assert (same.generation, same.added, same.is_whole) == (now, (), False)
+        store.add_references(OFFICE, [described("b")])
+        assert [it.reference_id for it in store.list_changes(OFFICE, now, "vlad").added] == ["b"]
+        store.delete_scene(OFFICE)
+        with pytest.raises(errors.NotFound):
+            store.list_changes(OFFICE, now, "vlad")

@@ -152,12 +152,16 @@ class StoreReader:
         DataLoss if the attributes are damaged.
         """
         state = self._state
-        cached = None if self.database.is_shared else self._scenes.get(scene_key)
-        if cached is not None and cached[0] is state:
-            return cached[1].attributes
-        with self.database.read() as connection:
-            scene = self._scene_state(connection, scene_key, state)
+        scene = self._known(scene_key, state)
+        if scene is None:
+            with self.database.read() as connection:
+                scene = self._scene_state(connection, scene_key, state)
         return scene.attributes
+
+    def _known(self, scene_key: SceneKey, state: object) -> SceneState | None:
+        """The scene in this state from memory; None where it is not there, or others write, too."""
+        cached = None if self.database.is_shared else self._scenes.get(scene_key)
+        return cached[1] if cached is not None and cached[0] is state else None
 
     def _scene_state(self, connection: Connection, scene_key: SceneKey, state: object) -> SceneState:
         """The scene as the connection's transaction sees it, begun in a state; from memory if nothing has changed."""
@@ -350,9 +354,14 @@ class StoreReader:
     def list_changes(self, scene_key: SceneKey, since_generation: int | None, descriptor_name: str) -> SceneChanges:
         """Reads what has changed in a scene since a generation, None for the whole scene, at one moment.
 
-        NotFound if there is no such scene.
+        Where only this process writes, the database is asked only after a change. NotFound if there is no such scene.
         """
+        state = self._state
+        scene = self._known(scene_key, state)
+        if scene is not None and scene.generation == since_generation:
+            return SceneChanges(since_generation, (), frozenset(), False)
         with self.database.read() as connection:
+            self._scene_state(connection, scene_key, state)
             return read_changes(connection, scene_key, since_generation, descriptor_name)
 
     def _cached(
