@@ -6,9 +6,11 @@ are compiled code (`edgepoint2_heads`).
 """
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
@@ -60,10 +62,12 @@ class OnnxEdgePoint2:
     def maps(self, grey: NDArray[np.uint8]) -> tuple[Float, Describe]:
         """Logits (H, W) of a grey image (H, W), and what returns descriptors at keypoints; see `Describe`."""
         height, width = grey.shape
-        image = grey.astype(np.float32) / 255
-        image -= image.mean()
-        image /= np.sqrt(np.square(image).mean() + CONTRAST_EPSILON)
-        padded = np.pad(image, ((0, -height % MULTIPLE_PX), (0, -width % MULTIPLE_PX)))
+        mean, sigma = (float(it[0, 0]) for it in cv2.meanStdDev(grey))
+        scale = 1 / math.sqrt(sigma**2 + 255**2 * CONTRAST_EPSILON)
+        padded = np.zeros((height + -height % MULTIPLE_PX, width + -width % MULTIPLE_PX), np.float32)
+        image = padded[:height, :width]
+        np.multiply(grey, np.float32(scale), out=image)
+        image -= np.float32(mean * scale)
         names = TRUNK if self._heads else ("logits", "features")
         found = [np.asarray(it)[0] for it in self._session.run(names, {"image": padded[None, None]})]
         logits = self._heads.logits(found) if self._heads else found[0][0]
