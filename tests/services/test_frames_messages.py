@@ -21,6 +21,7 @@ from mapless_server.engine.options import EngineOptions
 from mapless_server.images import ImageLimits
 from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.bundle.readout import ReadoutDirection, RollingShutter
+from mapless_server.method.groups.velocity import CORRELATION_S
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.services.messages.answers import (
@@ -29,7 +30,7 @@ from mapless_server.services.messages.answers import (
     session_from_message,
     set_frames,
 )
-from mapless_server.services.messages.groups import queries_from_message
+from mapless_server.services.messages.groups import queries_from_message, with_tracked_motion
 from mapless_server.services.messages.queries import photo_from_message, query_from_message
 from mapless_server.store import SceneAttributes
 
@@ -237,3 +238,20 @@ def test_a_rig_ignores_the_calibration_for_each_photograph(ignored: bool) -> Non
     rig = pb.LocalizeRigRequest(scene="scenes/hall", images=[image, image], options=options)
     queries = queries_from_message(rig, "images", (1, 8), "", EngineOptions(), SceneAttributes())
     assert [it.is_generic for it in queries] == [ignored, ignored]
+
+
+def test_times_and_poses_of_frames_say_how_a_camera_moved() -> None:
+    frames = [pb.SequenceFrame(image=PHOTO, intrinsics=wire.camera_to_message(CAMERA)) for _ in range(2)]
+    poses = [RigidTransform(np.eye(3), np.array([0.0, 0.0, 0.1 * i])) for i in range(2)]
+    for i, frame in enumerate(frames):
+        frame.intrinsics_uncertainty.readout_s = 0.02
+        frame.capture_time.FromMilliseconds(1_700_000_000_000 + 100 * i)
+        frame.session_from_camera.CopyFrom(wire.transform_to_message(poses[i]))
+    request = pb.LocalizeSequenceRequest(scene="scenes/hall", frames=frames)
+    queries = queries_from_message(request, "frames", (2, 16), "", EngineOptions(), SceneAttributes())
+    for query in with_tracked_motion(queries, request, poses):
+        assert query.options.shutter is not None
+        assert query.options.shutter.tracked is not None
+        known = math.exp(-0.05 / CORRELATION_S)
+        expected = [0, 0, -0.02 * known, 0, 0, 0]
+        np.testing.assert_allclose(query.options.shutter.tracked.mean, expected, atol=1e-6)

@@ -13,9 +13,17 @@ from support.scenes import SyntheticScene, random_for
 from mapless.geometry import Array, Camera
 from mapless.lenses import RadialTangential
 from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance
+from mapless_server.method.bundle.pose_problem import AdjustOptions
 from mapless_server.method.bundle.priors import NO_PRIORS
 from mapless_server.method.bundle.readout import ReadoutDirection, RollingShutter, TrackedMotion
-from mapless_server.method.bundle.shutter import MotionPrior, row_times, still_view, without_motion
+from mapless_server.method.bundle.shutter import (
+    MotionPrior,
+    StillView,
+    row_times,
+    still_view,
+    with_motion,
+    without_motion,
+)
 from mapless_server.method.features.views import Features, View, undistort_pixels
 from mapless_server.method.localize import localize
 from mapless_server.method.optim.optimize import perturbed, rotation_vector
@@ -150,3 +158,21 @@ def test_a_wrong_match_beside_the_camera_does_not_hide_a_motion() -> None:
     for shutter in (SHUTTER, tracked):
         still = still_view(moving.query, seen, matches.keypoint, estimate.world_from_camera, shutter)
         assert np.abs(still.motion - motion)[3:].max() < 0.005
+
+
+def test_a_step_beyond_the_linear_widens_the_radius_alone() -> None:
+    moving = read_by_rows(SCENE, 3 * np.array(MOTIONS["pan"]))
+    structure, matches, estimate = stages(moving, moving.references)
+    support = PosedSupport(
+        moving.query,
+        moving.references,
+        structure,
+        matches,
+        np.zeros(3),
+        estimate=estimate,
+    )
+    still = StillView(moving.query, row_times(moving.query, SHUTTER), np.full(6, 0.5), estimate.world_from_camera)
+    found = with_motion(support, still, SHUTTER, AdjustOptions())
+    assert found.world_from_camera is estimate.world_from_camera
+    before, after = (accuracy_from_covariance(it.covariance).position_95_m for it in (estimate, found))
+    assert after > 3 * before

@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from mapless.geometry import Array, RigidTransform
 
-from ..features.limits import INEXACT_INLIER_PX
+from ..features.limits import INEXACT_INLIER_PX, INLIER_PX
 from ..features.views import View
 from ..optim.optimize import (
     MinimizeOptions,
@@ -209,8 +209,13 @@ def with_motion(
     off = motions - motion
     covariance = np.einsum("s,sij->ij", probability, covariances + off[:, :, None] * off[:, None])
     by_motion = equations.motion
-    pose = moved(estimate.world_from_camera, by_motion @ (motion - removed))
-    return _with_covariance(replace(estimate, world_from_camera=pose), by_motion @ covariance @ by_motion.T)
+    step = by_motion @ (motion - removed)
+    pose = moved(estimate.world_from_camera, step)
+    change = by_motion @ covariance @ by_motion.T
+    seen = support.matches.seen(support.query, support.structure.x_in_world)[estimate.inliers]
+    if not np.median(seen.errors_px(pose)) < INLIER_PX:  # the equations are not linear so far
+        pose, change = estimate.world_from_camera, change + np.outer(step, step)
+    return _with_covariance(replace(estimate, world_from_camera=pose), change)
 
 
 def without_motion(support: PosedSupport, time: Array, shutter: RollingShutter) -> PoseEstimate:
