@@ -25,8 +25,8 @@ from .sender import connected
 from .step import Step, closed_loop_step
 from .watch import ServerUnderLoad
 
-MIN_CALLS_PER_S = 300.0
-MAX_OVERHEAD_MS = 2.0
+MIN_CALLS_PER_S = 600.0
+MAX_OVERHEAD_MS = 1.2
 BARE, ECHO, MAPLESS = "bare, short answer", "bare echo", "mapless, no-op"
 
 
