@@ -1,6 +1,6 @@
 """Motion during the read-out of a rolling shutter: how radii and errors depend on the prior of the motion.
 
-Four places of the rendered room, each with the twelve motions of `rendered_room.rolling`, are localized against the
+Two places of the rendered room, each with the twelve motions of `rendered_room.rolling`, are localized against the
 demo's references in this process, with SIFT: without a read-out time, and with it by other priors.
 """
 
@@ -32,7 +32,7 @@ from ..rendered_room.photographs import Station, scatter
 from ..rendered_room.rolling import CAMERA, MOTIONS, STILL, rolled
 from .page import Measurement, Row
 
-READOUT_S, FIRST, PLACES = 0.033, 8, 4
+READOUT_S, FIRST, PLACES = 0.033, 8, 2
 SHARPER = 0.36
 """By which radii of this room are smaller when its references have calibrated them."""
 PRIORS: dict[str, tuple[Sequence[float], Sequence[float], float]] = {
