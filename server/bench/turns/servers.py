@@ -26,12 +26,14 @@ class Side:
     folder: Path
 
     @contextmanager
-    def server(self, store: str, features: str | None = None, background: bool = False) -> Iterator[ChildServer]:
-        """Runs a server on a store of that name; features None are those of the environment."""
+    def server(
+        self, store: str, features: str | None = None, background: bool = False, port: int = 0
+    ) -> Iterator[ChildServer]:
+        """Runs a server on a store of that name; features None are those of the environment, port 0 is any."""
         environment = {"PYTHONPATH": f"{self.tree / 'client'}:{self.tree / 'server'}", "PYTHONDONTWRITEBYTECODE": ""}
         environment |= {} if background else NO_BACKGROUND
         environment |= {} if features is None else {"MAPLESS_FEATURES": features}
-        with child_server(self.folder / store, environment=environment) as server:
+        with child_server(self.folder / store, {"--port": str(port)}, environment) as server:
             yield server
 
 

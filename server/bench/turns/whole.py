@@ -2,13 +2,18 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
-from time import perf_counter
+from time import perf_counter, sleep
 
+import grpc
 import numpy as np
 
+from bench.load.driving import free_port
 from mapless import Client
-from mapless_tools.child import ChildServer
+from mapless.v1 import reference_service_pb2 as pb
+from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
+from mapless_tools.child import CONNECT, ChildServer
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.run import SCENE, store_references
 
@@ -17,15 +22,17 @@ from .query import localized
 from .servers import Side, connected, processor_s
 
 CLIENTS = 8
+_ASKED_EVERY_S = 0.02
 IMPORT = (
     ("import, processor time a reference", "ms"),
     ("import, time a reference", "ms"),
     ("from the first upload to the first answer", "s"),
 )
 START = (
-    ("start to the first call, time", "s"),
-    ("start to the first call, processor time", "s"),
-    ("memory at the first call", "MiB"),
+    ("start to the first list of scenes, time", "s"),
+    ("start to ready, time", "s"),
+    ("start to ready, processor time", "s"),
+    ("memory when ready", "MiB"),
     ("first localization", "ms"),
 )
 SATURATION = (
@@ -63,12 +70,23 @@ def measure_start(
             store_references(client, SCENE, references, lambda *_: None)
     found: list[list[list[float]]] = [[], []]
     for turn in TURNS * rounds:
-        begin_s = perf_counter()
-        with sides[turn].server(store, features) as server, connected(server) as client:
-            list(client.list_scenes())
-            started = [perf_counter() - begin_s, processor_s(server.process_id), _resident_mib(server)]
-            found[turn].append([*started, 1e3 * localized(client, server, query)[1]])
+        port, begin_s = free_port(), perf_counter()
+        with ThreadPoolExecutor(1) as thread:
+            listed = thread.submit(_until_listed, f"127.0.0.1:{port}")
+            with sides[turn].server(store, features, port=port) as server, connected(server) as client:
+                started = [perf_counter() - begin_s, processor_s(server.process_id), _resident_mib(server)]
+                first_ms = 1e3 * localized(client, server, query)[1]
+                found[turn].append([listed.result() - begin_s, *started, first_ms])
     return figures_of_turns([(f"{features}: {name}", unit) for name, unit in START], found)
+
+
+def _until_listed(address: str) -> float:
+    """Asks a starting server for its scenes until it answers; returns when it did."""
+    while True:
+        with grpc.insecure_channel(address) as channel, suppress(grpc.RpcError):
+            ReferenceServiceStub(channel).ListScenes(pb.ListScenesRequest(page_size=1), timeout=CONNECT.timeout_s)
+            return perf_counter()
+        sleep(_ASKED_EVERY_S)
 
 
 def measure_saturation(
