@@ -87,17 +87,25 @@ SHOTS = [Shot(Photo(photograph(it), CAMERA, "image"), it) for it in REFERENCE_PO
 
 @contextmanager
 def localizing(
-    folder: Path, tiers: Sequence[Tier], doubtful_trust: float = 0.25, shots: Sequence[Shot] = SHOTS
+    folder: Path,
+    tiers: Sequence[Tier],
+    doubtful_trust: float = 0.25,
+    shots: Sequence[Shot] = SHOTS,
+    described: int | None = None,
 ) -> Iterator[Localize]:
+    """References of which so many have all features and vectors, None for all, and the others the first ones."""
     caller, loop = Caller(Flow("tenant", "client"), time.monotonic() + 600), asyncio.new_event_loop()
     with Store.open(folder) as store:
         options = EngineOptions(doubt=DoubtOptions(doubtful_trust))
         engine = engine_over(store, tiers, options)
-        described = describe_all(engine, [it.photo for it in shots])
+        photos = [it.photo for it in shots]
+        found_all = describe_all(engine, photos[:described])
+        if left := photos[len(found_all) :]:
+            found_all += loop.run_until_complete(engine.describe(left, caller))
         store.create_scene(SCENE)
         references = [
             NewReference(name, it.photo.image, it.photo.camera, it.world_from_camera, found.views, found.descriptors)
-            for name, it, found in zip(NAMED, shots, described, strict=True)
+            for name, it, found in zip(NAMED, shots, found_all, strict=True)
         ]
         store.add_references(SCENE, references)
 
@@ -228,6 +236,20 @@ def test_a_photograph_found_beyond_its_limits_is_not_tried_turned(localize: Loca
     assert isinstance(result.answer.outcome, Rejection)
     assert result.answer.outcome.reason is RejectionReason.PRIOR_CONFLICT
     assert "turned" not in {it.rung for it in result.attempts}
+
+
+def test_what_lacks_vectors_is_likely_by_the_photograph_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where its mirror image is matched, which not all features can be."""
+    for name, seconds in (("MAKE_S", 0.0), ("LACKING_S", 600.0)):
+        monkeypatch.setattr(f"mapless_server.engine.search.{name}", seconds)
+    image = np.ascontiguousarray(decode_image(photograph(TRUE), ImageLimits())[:, ::-1])
+    with localizing(tmp_path, tiers(), described=4) as localize:
+        result = localize(encode(".png", image), CAMERA)
+    assert "mirrored" in [it.rung for it in result.attempts]
+    assert "failed" not in [it.outcome for it in result.attempts]
+    assert {it.kind for it in result.missing} >= {"features", "retrieval"}
 
 
 @pytest.mark.parametrize("named", [NAMED, ()], ids=["named", "chosen"])

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapless_server.engine.photo_views import QueryViews
+from mapless_server.engine.photo_views import QueryViews, RasterForm
 from mapless_server.engine.query import Description, Photo
 from mapless_server.errors import DataLoss, InvalidArgument
 from mapless_server.images import ImageLimits, decode_depth
@@ -118,7 +118,8 @@ class References:
         lacking = {key for _, key in entries.undescribed()}
         if not lacking:
             return entries
-        vector = main.descriptor.describe(views.view(main.extractor, context))
+        # Of the photograph as it is: features of its mirror image, say, are not those of all extractors.
+        vector = main.descriptor.describe(views.in_form(RasterForm()).view(main.extractor, context))
         likely = rank_references(main.indexes.entries(scene_key, context), vector, selection)
         own.indexes.describe(scene_key, [(it.reference_id, it.key) for it in likely if it.key in lacking], context)
         entries = own.indexes.entries(scene_key, context, waits=False)
