@@ -10,20 +10,23 @@ import pytest
 from scipy.special import bdtrik
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
-from mapless_server.method.bundle.estimate import accuracy_from_covariance
+from mapless_server.method.bundle.estimate import Accuracy, PosedSupport, accuracy_from_covariance, viewpoint_gap
 from mapless_server.method.bundle.priors import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
+from mapless_server.scenes.calibration.calibrator import FIRST_SAMPLE
+from mapless_server.scenes.calibration.fit import FitOptions, LeftOut
 from mapless_tools.dataset import Dataset
 from research.described import METRIC, OTHERS, Described, Measured, Pair, answered, cross_pairs, right_pairs
+from research.evidence.first_answers import Asked, calibrated
 
 from .conftest import read_place_once
 
 pytestmark = pytest.mark.realdata
 
 Photographs = Callable[[str], Dataset]
-FOUNTAIN, HERZ = "fountain-P11", "herz-jesus-P8"
+FOUNTAIN, HERZ, OFFICE = "fountain-P11", "herz-jesus-P8", "tum-fr3-office"
 ALL = LocalizeOptions(coverage=1.0)
 """Whatever passes the gate is answered, with its trust."""
 STRANGER_PARTS = 4
@@ -125,43 +128,50 @@ def fewest(probability: float, count: int, share: float) -> float:
     return float(np.ceil(bdtrik(probability, count, share)))
 
 
-def held(scene: str, k: int) -> tuple[int, dict[str, int]]:
-    """Answers of a scene's photographs, each left out once and given K references, and how many radii held."""
-    found = list(answered(right_pairs(read_place_once(scene), None, (k,)), LocalizeOptions(coverage=1.0)))
-    rows: list[Sequence[bool]] = []
-    for it in found:
+def left_out(scene: str, k: int) -> list[LeftOut]:
+    """The right answers to a scene's photographs, each localized by K others."""
+    found = list[LeftOut]()
+    for it in answered(right_pairs(read_place_once(scene), None, (k,)), LocalizeOptions(coverage=1.0)):
         assert isinstance(it.answer.outcome, Localization)
+        assert isinstance(it.answer.support, PosedSupport)
         assert it.answer.outcome.covariance is not None
         assert it.off is not None
-        radii, (off_m, off_deg) = accuracy_from_covariance(it.answer.outcome.covariance), it.off
-        rows.append(
-            (
-                off_m <= radii.position_68_m,
-                off_m <= radii.position_95_m,
-                off_deg <= radii.rotation_68_deg,
-                off_deg <= radii.rotation_95_deg,
-            )
-        )
-    names = ("position 68", "position 95", "rotation 68", "rotation 95")
-    return len(rows), dict(zip(names, np.sum(rows, axis=0).tolist(), strict=True))
+        radii = accuracy_from_covariance(it.answer.outcome.covariance)
+        found.append(LeftOut(*it.off, radii, trust_of(it), *viewpoint_gap(it.answer.support)))
+    return found
 
 
-@pytest.mark.parametrize(
-    ("scene", "k"), [("fountain-P11", 5), pytest.param("tum-fr3-office", 10, marks=pytest.mark.nightly)]
-)
-def test_radii_contain_the_truth_as_often_as_stated(photographs: Callable[[str], Dataset], scene: str, k: int) -> None:
+def assert_held(answers: Sequence[LeftOut], radii: Sequence[Accuracy]) -> None:
     """Within what chance allows one time in a thousand; photographs of one walk are not independent, besides."""
-    photographs(scene)
-    count, shares = held(scene, k)
+    count, pairs = len(answers), list(zip(answers, radii, strict=True))
     assert count >= 11
     low, high = fewest(0.0005, count, 0.68), fewest(0.9995, count, 0.68)
-    for name in ("position 68", "rotation 68"):
-        assert low <= shares[name] <= high, (name, shares, count)
-    for name in ("position 95", "rotation 95"):
-        assert shares[name] >= fewest(0.0005, count, 0.95), (name, shares, count)
+    assert low <= sum(it.error_m <= own.position_68_m for it, own in pairs) <= high
+    assert low <= sum(it.error_deg <= own.rotation_68_deg for it, own in pairs) <= high
+    least = fewest(0.0005, count, 0.95)
+    assert sum(it.error_m <= own.position_95_m for it, own in pairs) >= least
+    assert sum(it.error_deg <= own.rotation_95_deg for it, own in pairs) >= least
 
 
-FOUNTAIN, OFFICE = "fountain-P11", "tum-fr3-office"
+def test_radii_contain_the_truth_as_often_as_stated(photographs: Photographs) -> None:
+    photographs(FOUNTAIN)
+    answers = left_out(FOUNTAIN, 5)
+    assert_held(answers, [it.claimed for it in answers])
+
+
+@pytest.mark.nightly
+def test_eight_references_calibrate_the_radii_of_a_scene(photographs: Photographs) -> None:
+    """Of the office, where generic radii are too small."""
+    photographs(OFFICE)
+    answers = left_out(OFFICE, 10)
+    radii = []
+    for i, it in enumerate(answers):
+        others = [*answers[:i], *answers[i + 1 :]]
+        first = [others[j] for j in np.linspace(0, len(others) - 1, FIRST_SAMPLE).round().astype(int)]
+        radii.append(calibrated(Asked(OFFICE, i, 10, it, tuple(first)), FitOptions()))
+    assert_held(answers, radii)
+
+
 SENSORS = {"none": 0.0, "1°": 1.0, "upside down": -1.0}
 """Signs of what an accelerometer with a noise of 1 degree measures; without one, 0."""
 
