@@ -5,7 +5,7 @@ can be written down, and reads back as it was; a page begins after a legal id.
 """
 
 import asyncio
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import datetime, timezone
 from functools import cache, partial
@@ -47,6 +47,7 @@ METHODS = {GetMessageClass(method.input_type): method.name for method in _SERVIC
 KINDS = tuple(METHODS)
 TENANT = "acme"
 NOTHING_KNOWN = SceneAttributes()
+NO_LABELS: Mapping[str, str] = {}
 DEPTH = DepthImage.of_metres(np.full((CAMERA.height_px, CAMERA.width_px), 2.0, np.float32), DepthSensor.STEREO)
 _NOW = datetime(2026, 11, 21, tzinfo=timezone.utc)
 _VIEW = View(CAMERA, Features(np.ones((2, 2), np.float32), np.ones((2, 4), np.float32), np.ones(2, np.float32)))
@@ -135,23 +136,28 @@ class WatchfulStore:
     def get_attributes(self, key: SceneKey) -> SceneAttributes:
         return self.create_scene(key).attributes
 
-    def create_scene(self, key: SceneKey, attributes: SceneAttributes = NOTHING_KNOWN) -> SceneRecord:
+    def create_scene(
+        self, key: SceneKey, attributes: SceneAttributes = NOTHING_KNOWN, labels: Mapping[str, str] = NO_LABELS
+    ) -> SceneRecord:
         check_key(key)
+        check_labels(labels)
         row = rows.attributes_row(key, attributes)
         owner = rows.attributes_owner(key)
         assert codec.decode_attributes(owner, row["attributes"], row["attributes_sha256"]) == attributes
-        return SceneRecord(key, 1, 0, _NOW, attributes)
+        return SceneRecord(key, 1, 0, _NOW, attributes, labels)
 
     def update_scene(self, key: SceneKey, **changes: Any) -> SceneRecord:
         assert changes
         assert UNCHANGED not in changes.values()
-        return self.create_scene(key, SceneAttributes(**changes))
+        labels = changes.pop("labels", NO_LABELS)
+        return self.create_scene(key, SceneAttributes(**changes), labels)
 
     def delete_scene(self, key: SceneKey) -> None:
         check_key(key)
 
-    def list_scenes(self, tenant: str, limit: int, after: str) -> list[SceneRecord]:
+    def list_scenes(self, tenant: str, limit: int, after: str, labels: Mapping[str, str]) -> list[SceneRecord]:
         check_page(limit, after)
+        check_labels(labels)
         return [self.create_scene(key_of(tenant, f"s{i}")) for i in range(min(limit, 3))]
 
     def add_references(self, key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
@@ -189,6 +195,14 @@ def check_page(limit: int, after: str) -> None:
     """It is part of a list."""
     assert 2 <= limit <= MAX_PAGE_SIZE + 1
     assert not after or check_id(after)
+
+
+def check_labels(labels: Mapping[str, str]) -> None:
+    """They fit the columns of their table."""
+    for name, value in labels.items():
+        assert 1 <= len(name) <= 64
+        assert 1 <= len(value) <= 128
+        assert value.isprintable()
 
 
 def _stored(key: SceneKey, new: NewReference) -> ReferenceRecord:

@@ -27,7 +27,11 @@ SAME = 1e-9
 T = TypeVar("T")
 
 
-def planted(case: str, *, intrinsics: bool) -> tuple[BundleProblem, Bundle]:
+UNKNOWNS = (0, 4, 10)
+"""Of the query beside its pose: none, errors of its intrinsics, and its motion during the read-out besides."""
+
+
+def planted(case: str, unknowns: int) -> tuple[BundleProblem, Bundle]:
     """A problem of five references off its optimum, of which every third point is missing in the first."""
     scene = make_scene(random_for(case), SceneOptions(point_count=120, reference_count=5))
     structure, matches = true_structure(scene, NOISE)
@@ -38,10 +42,29 @@ def planted(case: str, *, intrinsics: bool) -> tuple[BundleProblem, Bundle]:
     problem, start = pose_problem(given, np.arange(len(matches)), scene.world_from_query)
     motion = random_for(case, "moved").normal(0, 1e-3, (6, 6))
     bundle = start.bundle.moved(motion, np.zeros_like(start.bundle.points))
-    if not intrinsics:
+    if not unknowns:
         return problem, bundle
     wider, bundle = with_intrinsics(problem, bundle, scene.query)
-    return wider, replace(bundle, intrinsics=np.array([1e-3, 0.5, -0.5, 2e-3]))
+    bundle = replace(bundle, intrinsics=np.array([1e-3, 0.5, -0.5, 2e-3]))
+    return (wider, bundle) if unknowns == 4 else with_motion(case, wider, bundle)
+
+
+def with_motion(case: str, problem: BundleProblem, bundle: Bundle) -> tuple[BundleProblem, Bundle]:
+    """The problem with six more unknowns, each observation of the query at a time of its own."""
+    seen, more = problem.by_view, np.full(6, 1e-3)
+    by_pose = seen.at(bundle).by_pose[:, :, seen.parts[-1]]
+    by_motion = by_pose * random_for(case, "times").uniform(-0.5, 0.5, by_pose.shape[2])
+    columns = replace(seen, by_intrinsics=np.concatenate([seen.by_intrinsics, by_motion], axis=1))
+    information, offset = problem.intrinsics_information, problem.intrinsics_offset
+    assert information is not None
+    assert offset is not None
+    wider = replace(
+        problem,
+        by_view=columns,
+        intrinsics_information=np.concatenate([information, more]),
+        intrinsics_offset=np.concatenate([offset, more]),
+    )
+    return wider, replace(bundle, intrinsics=np.concatenate([bundle.intrinsics, more]))
 
 
 def by_both(monkeypatch: pytest.MonkeyPatch, compute: Callable[[], T]) -> tuple[T, T]:
@@ -57,26 +80,26 @@ def assert_same(first: Array, second: Array, share: float = SAME) -> None:
     np.testing.assert_allclose(first, second, rtol=0, atol=share * np.abs(second).max(initial=0.0))
 
 
-@pytest.mark.parametrize("intrinsics", [False, True])
-def test_residuals_and_derivatives(monkeypatch: pytest.MonkeyPatch, intrinsics: bool) -> None:
-    problem, bundle = planted("project", intrinsics=intrinsics)
+@pytest.mark.parametrize("unknowns", UNKNOWNS)
+def test_residuals_and_derivatives(monkeypatch: pytest.MonkeyPatch, unknowns: int) -> None:
+    problem, bundle = planted("project", unknowns)
     first, second = by_both(monkeypatch, lambda: problem.at(bundle))
     for name in ("residual", "by_point", "by_pose"):
         assert_same(getattr(first, name), getattr(second, name))
 
 
 def test_residuals_behind_a_camera_are_not_a_number() -> None:
-    problem, bundle = planted("behind", intrinsics=False)
+    problem, bundle = planted("behind", 0)
     bundle.points[3] = bundle.poses.centres[-1] - bundle.poses.rotation[-1][2]
     is_nan = np.asarray(np.isnan(problem.at(bundle).residual).all(axis=0))
     assert is_nan[(problem.by_view.point == 3) & (problem.by_view.view == 5)].all()
     assert not is_nan[problem.by_view.point != 3].any()
 
 
-@pytest.mark.parametrize("intrinsics", [False, True])
+@pytest.mark.parametrize("unknowns", UNKNOWNS)
 @pytest.mark.parametrize("least_curvature", [0.5, 1.0])
-def test_a_step_of_the_bundle(monkeypatch: pytest.MonkeyPatch, intrinsics: bool, least_curvature: float) -> None:
-    problem, bundle = planted("step", intrinsics=intrinsics)
+def test_a_step_of_the_bundle(monkeypatch: pytest.MonkeyPatch, unknowns: int, least_curvature: float) -> None:
+    problem, bundle = planted("step", unknowns)
     curved = replace(problem, least_curvature=least_curvature)
 
     def step() -> tuple[Array, Array, Linearized | None]:
@@ -95,8 +118,9 @@ def test_a_step_of_the_bundle(monkeypatch: pytest.MonkeyPatch, intrinsics: bool,
     assert_same(first[2].bundle.intrinsics, second[2].bundle.intrinsics)
 
 
-def test_changes_without_parts_of_the_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, bundle = planted("dispersion", intrinsics=True)
+@pytest.mark.parametrize("unknowns", UNKNOWNS[1:])
+def test_changes_without_parts_of_the_data(monkeypatch: pytest.MonkeyPatch, unknowns: int) -> None:
+    problem, bundle = planted("dispersion", unknowns)
     first, second = by_both(monkeypatch, lambda: disperse(problem, bundle, 60))
     assert first
     assert second

@@ -11,7 +11,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { POSE = 6, MOST_INTRINSICS = 4, MOST_ROWS = POSE + MOST_INTRINSICS, LANES = 8, MOST_LANES = 2 * LANES };
+enum { POSE = 6, MOST_INTRINSICS = 10, MOST_ROWS = POSE + MOST_INTRINSICS, LANES = 8, MOST_LANES = 2 * LANES };
 
 /* The damping, and its factors after a step that is accepted and after one that is not: as in optimize.minimize_each. */
 #define FIRST_DAMPING 1e-3

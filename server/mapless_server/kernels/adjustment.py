@@ -24,8 +24,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 POSE = 6
-MOST_INTRINSICS = 4
-"""Unknowns of a camera's pose, and of its intrinsics at most."""
+MOST_INTRINSICS = 10
+"""Unknowns of a camera's pose, and at most of the query's intrinsics and of its motion during the read-out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Seen:
         end: (V,) where the observations of each view end.
         point, view: (O,) indices of each observation's point and view; a point is at most once in a view.
         points: P.
-        intrinsics: I, unknown errors of the query's intrinsics, at most 4. U = 6 V + I are all unknowns but the points.
+        intrinsics: I, unknowns of the query beside its pose, at most 10. U = 6 V + I are all unknowns but the points.
     """
 
     end: Indices
