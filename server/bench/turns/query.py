@@ -1,5 +1,6 @@
 """A warm query: both servers have the same references, and localize each photograph by turns."""
 
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.run import SCENE, store_references
 
 from .comparison import TURNS, Figure
-from .servers import connected, processor_s
+from .servers import connected, processor_s, wait_until_idle
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,16 @@ class Measured:
 def measure(
     servers: Sequence[ChildServer], references: Sequence[Frame], queries: Sequence[Frame], rounds: int, tracking: bool
 ) -> list[Measured]:
-    """Localizes photographs on two servers by turns, after once each on both; the servers choose the references."""
+    """Localizes photographs on two servers by turns, after once each on both; the servers choose the references.
+
+    It begins when both are idle after the import.
+    """
     with ExitStack() as stack:
         clients = [stack.enter_context(connected(server)) for server in servers]
         for client in clients:
             store_references(client, SCENE, references, lambda *_: None)
+        if not wait_until_idle(servers):
+            print("The servers were not idle after the import: it costs queries processor time.", file=sys.stderr)
         measured = []
         random = np.random.default_rng(0)
         for frame in queries:

@@ -5,7 +5,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +15,10 @@ from mapless_tools.child import CONNECT, ChildServer, child_server
 from mapless_tools.usage import UsageError
 
 NO_BACKGROUND = {"MAPLESS_BACKGROUND_MATCHING": "false"}
+_IDLE_SHARE = 0.05
+"""A server that uses less of a core is idle."""
+_QUIET_S = 3.0
+_LONGEST_WAIT_S = 120.0
 
 
 @dataclass(frozen=True)
@@ -77,3 +81,21 @@ def connected(server: ChildServer) -> Iterator[Client]:
 def processor_s(process_id: int) -> float:
     """Processor time of another process, to the nanosecond, by the clock that clock_getcpuclockid defines on Linux."""
     return time.clock_gettime((~process_id << 3) | 2)
+
+
+def wait_until_idle(servers: Sequence[ChildServer]) -> bool:
+    """Waits until all servers have been idle for 3 s, at most 120 s; returns whether they have.
+
+    After an import a server goes on: it loads stronger features, and calibrates.
+    """
+    begin_s = quiet_since_s = time.monotonic()
+    used_s = [processor_s(it.process_id) for it in servers]
+    while (now_s := time.monotonic()) - quiet_since_s < _QUIET_S:
+        if now_s - begin_s > _LONGEST_WAIT_S:
+            return False
+        time.sleep(0.5)
+        last_s, used_s = used_s, [processor_s(it.process_id) for it in servers]
+        spent_s = max(after - before for before, after in zip(last_s, used_s, strict=True))
+        if spent_s > _IDLE_SHARE * (time.monotonic() - now_s):
+            quiet_since_s = time.monotonic()
+    return True

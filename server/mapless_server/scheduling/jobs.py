@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
+from .processor import give_way
+
 PayloadT = TypeVar("PayloadT")
 """The input of the job's stages."""
 ValueT = TypeVar("ValueT")
@@ -218,6 +220,7 @@ class _Life:
     checked_s: float = -math.inf
 
     def check(self) -> None:
+        give_way()
         self.checked_s = time.monotonic()
         if self.over:
             raise Abandoned

@@ -1,50 +1,67 @@
-"""Processor time of a thread, with that of the threads that compute a part of its work; and its priority."""
+"""Processor time of a thread, with that of the threads that compute a part of its work; and threads that give way."""
 
-import os
-import sys
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable
 
-NICENESS = 10
-"""Niceness of threads of low priority, above the process's own. Evidence: lost-robots.
-
-Linux gives such a thread a tenth of a core that another one of the process wants, and all of one that no other wants.
-"""
-
-
-class _Helped(threading.local):
-    """Processor time that other threads have spent for this thread, and whether it is of low priority."""
-
-    seconds = 0.0
-    is_low = False
+SHARE_BESIDE_OTHERS = 0.1
+"""Share of a core that a thread that gives way takes while others compute. Evidence: lost-robots."""
+LONGEST_PAUSE_S = 0.5
+"""A pause ends after this time: the thread may hold what others wait for. The rest is left for the next one."""
+_LOOK_S = 0.01
 
 
-_helped = _Helped()
+class _Thread(threading.local):
+    """The calling thread: processor time that others have spent for it; if it gives way, the pause that it owes."""
+
+    helped_s = 0.0
+    others_compute: Callable[[], bool] | None = None
+    computed_s = 0.0
+    owed_s = 0.0
+
+
+_thread = _Thread()
 
 
 def processor_s() -> float:
     """Processor time of the calling thread since it began, and of its helpers (`count_helper`), seconds."""
-    return time.thread_time() + _helped.seconds
+    return time.thread_time() + _thread.helped_s
 
 
 def count_helper(seconds: float) -> None:
     """Counts processor time that another thread has spent for the calling one."""
-    _helped.seconds += seconds
+    _thread.helped_s += seconds
 
 
 def may_have_helpers() -> bool:
-    """Whether other threads may compute for the calling one; for one of low priority they would have a higher one."""
-    return not _helped.is_low
+    """Whether other threads may compute for the calling one; for one that gives way they would not do so."""
+    return _thread.others_compute is None
 
 
-def lower_priority() -> None:
-    """Lets the calling thread, and those that it starts, compute only when others leave a core free, where possible.
+def lower_priority(others_compute: Callable[[], bool]) -> None:
+    """Lets the calling thread give way at each `give_way` while others compute, see there.
 
-    Only Linux has a niceness of threads; elsewhere, or where it is not permitted, they share the cores equally.
+    It is no niceness of the system's: a thread that the system does not run, because other programs want the cores,
+    may hold the interpreter's lock, and then every thread of the process waits for it.
     """
-    _helped.is_low = True
-    if sys.platform == "linux":
-        with suppress(OSError):
-            own = threading.get_native_id()
-            os.setpriority(os.PRIO_PROCESS, own, os.getpriority(os.PRIO_PROCESS, own) + NICENESS)
+    _thread.others_compute = others_compute
+    _thread.computed_s = time.thread_time()
+
+
+def give_way() -> None:
+    """Pauses a thread of low priority while others compute, as long as its share demands; returns at once in others.
+
+    What it computes while no others do is not counted.
+    """
+    others_compute = _thread.others_compute
+    if others_compute is None:
+        return
+    spent_s = time.thread_time() - _thread.computed_s
+    _thread.owed_s += spent_s * (1 / SHARE_BESIDE_OTHERS - 1)
+    begin_s = now_s = time.monotonic()
+    until_s = begin_s + min(_thread.owed_s, LONGEST_PAUSE_S)
+    while now_s < until_s and others_compute():
+        time.sleep(_LOOK_S)
+        now_s = time.monotonic()
+    _thread.owed_s = max(0.0, _thread.owed_s - (now_s - begin_s)) if now_s >= until_s else 0.0
+    _thread.computed_s = time.thread_time()

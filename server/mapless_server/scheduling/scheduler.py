@@ -179,6 +179,11 @@ class Scheduler:
         """Whether a job waits for an idle thread of a lane, of low priority or not."""
         return self._lanes[lane_name].has_work(is_low)
 
+    def computes(self, lane_name: str) -> bool:
+        """Whether a thread of a lane computes that is not of low priority; for threads without the queue's lock."""
+        lane = self._lanes[lane_name]
+        return lane.free < lane.threads
+
     def take(self, lane_name: str, now_s: float, is_low: bool = False) -> Batch | None:
         """Selects what a thread of a lane computes now; None if all threads are busy or no job waits.
 

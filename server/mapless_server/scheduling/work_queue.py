@@ -311,7 +311,7 @@ class WorkQueue:
         assert self._loop is not None
         try:
             if crew[1]:
-                lower_priority()
+                lower_priority(partial(self._scheduler.computes, crew[0]))
             while (batch := self._next_batch(crew)) is not None:
                 begin_s = processor_s()
                 results = self._compute_batch(batch.stage, batch.jobs)

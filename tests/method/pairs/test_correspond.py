@@ -507,7 +507,7 @@ def test_a_thread_of_low_priority_computes_alone() -> None:
     shared, seen = SharedThreads(3), set[int]()
 
     def compute() -> None:
-        lower_priority()
+        lower_priority(lambda: False)
         shared.map(lambda _: seen.add(threading.get_ident()), range(20))
         assert seen == {threading.get_ident()}
 
