@@ -106,7 +106,7 @@ def turned_by_gravity(search: Search, tier: Tier) -> Search:
     if not turn_deg:
         return search
     photo = replace(query.photo, upright_deg=turn_deg)
-    return replace(search, query=replace(query, photo=photo), views=search.views.of(photo))
+    return search.but(query=replace(query, photo=photo), views=search.views.of(photo))
 
 
 def _narrowing_of(search: Search) -> Narrowing:
@@ -158,9 +158,9 @@ def compared(search: Search) -> Search:
     found = [similarity_of(material.view, reference.view, matches) for reference, matches in pairs]
     is_enough = search.query.is_part or search.query.photo.depth is not None
     agreement = max(search.agreement, agreement_of(found, material, is_enough))
-    search = replace(search, agreement=agreement)
+    search = search.but(agreement=agreement)
     is_upright = search.attempt.raster is Raster.AS_IS
-    return replace(search, angles_deg=_rasters_by(search, material, found)) if is_upright else search
+    return search.but(angles_deg=_rasters_by(search, material, found)) if is_upright else search
 
 
 def agreement_of(found: Sequence[Similarity | None], material: Material, is_enough: bool) -> float:

@@ -47,4 +47,4 @@ def without_unmatched(search: Search, features: str) -> Search:
     if not material.unmatched:
         return search
     search = search.cut(search.rung, features, CutReason.NO_TIME, len(material.unmatched))
-    return replace(search, material=replace(material, unmatched=()))
+    return search.but(material=replace(material, unmatched=()))

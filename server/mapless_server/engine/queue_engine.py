@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from typing import TypeVar
 
 from mapless_server.engine.photo_views import QueryViews
@@ -133,10 +132,10 @@ class QueueEngine:
         """
         views = QueryViews(query.photo, self.options.image_limits)
         search = Search.begin(query, source or self.references, views, caller.deadline_s)
-        search = replace(search, is_cut_at=lambda *_: self.queue.gets_cheap_steps(caller.flow))
+        search = search.but(is_cut_at=lambda *_: self.queue.gets_cheap_steps(caller.flow))
         if on_better is not None:
             loop = asyncio.get_running_loop()
-            search = replace(search, on_better=lambda result: loop.call_soon_threadsafe(on_better, result))
+            search = search.but(on_better=lambda result: loop.call_soon_threadsafe(on_better, result))
         size_bytes = 0 if query.is_part else query.photo.size_bytes  # which `hold` counts
         return Job(caller.flow, search.first_step, caller.deadline_s, size_bytes)
 

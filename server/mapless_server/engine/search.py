@@ -187,6 +187,17 @@ class Search:
         rung, attempt = first_attempt(query.can_be_tracked)
         return cls(query, source, views, deadline_s, on_better, rung, attempt)
 
+    def but(self, **changes: object) -> Search:
+        """A copy with these values: `dataclasses.replace` in a tenth of its time, a dozen times a query.
+
+        TypeError for a name that is no field.
+        """
+        if not changes.keys() <= self.__dict__.keys():
+            raise TypeError(f"a search has no {', '.join(sorted(changes.keys() - self.__dict__.keys()))}")
+        copy = object.__new__(Search)
+        copy.__dict__.update(self.__dict__, **changes)
+        return copy
+
     @property
     def attributes(self) -> SceneAttributes:
         """The attributes of the scene that the attempt's references are of."""
@@ -204,13 +215,12 @@ class Search:
         ended = Tried(self.rung, features, outcome, now.computed_s, now.processor_s, self.agreement)
         before = self.attempt if has_result else self.before
         tried = (*self.tried, self.attempt)
-        return replace(self, before=before, tried=tried, attempts=(*self.attempts, ended))
+        return self.but(before=before, tried=tried, attempts=(*self.attempts, ended))
 
     def to(self, rung: str, attempt: Attempt, give_up_s: float, features: str) -> Search:
         """The search at another attempt; `features` are those of the one before."""
         is_other = attempt.basis != self.attempt.basis or self.coarse is None
-        return replace(
-            self,
+        return self.but(
             rung=rung,
             attempt=attempt,
             give_up_s=give_up_s,
@@ -252,7 +262,7 @@ class Search:
 
     def cut(self, rung: str, features: str, reason: CutReason, unmatched: int = 0) -> Search:
         """The search with another cut of the ladder."""
-        return replace(self, cuts=(*self.cuts, LadderCut(rung, features, reason, unmatched)))
+        return self.but(cuts=(*self.cuts, LadderCut(rung, features, reason, unmatched)))
 
     @property
     def gets_cheap_rungs(self) -> bool:
@@ -270,14 +280,13 @@ class Search:
 
     def resumed(self) -> Search:
         """The search in a stage, in the thread that computes it."""
-        return replace(self, stage_start_s=time.monotonic(), stage_processor_s=processor_s())
+        return self.but(stage_start_s=time.monotonic(), stage_processor_s=processor_s())
 
     def paused(self, stage: Search) -> Search:
         """The search after a stage of its attempt, or of another one, whose time is then not its own."""
         if stage.stage_start_s is None or stage.stage_processor_s is None or stage.rung != self.rung:
-            return replace(self, stage_start_s=None, stage_processor_s=None)
-        return replace(
-            self,
+            return self.but(stage_start_s=None, stage_processor_s=None)
+        return self.but(
             computed_s=stage.computed_s + time.monotonic() - stage.stage_start_s,
             processor_s=stage.processor_s + processor_s() - stage.stage_processor_s,
             stage_start_s=None,

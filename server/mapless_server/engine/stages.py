@@ -122,9 +122,7 @@ class QueryStages:
             made = [error]
         share_s = (processor_s() - begin_s) / len(jobs)
         took_s = time.monotonic() - start_s
-        spent = [
-            replace(it, processor_s=it.processor_s + share_s, computed_s=it.computed_s + took_s) for it in searches
-        ]
+        spent = [it.but(processor_s=it.processor_s + share_s, computed_s=it.computed_s + took_s) for it in searches]
         return [
             self._stage_result(search, partial(self._reconstructed, coarse=coarse))
             for search, coarse in zip(spent, made, strict=True)
@@ -148,7 +146,7 @@ class QueryStages:
         # A reference deleted since the scene was listed was not the caller's choice: the next list is without it.
         is_outdated = isinstance(failure, NotFound) and failure.field != "scene" and not search.query.reference_ids
         if is_outdated and search.listings < MAX_LISTINGS:
-            again = replace(search, listings=search.listings + 1, material=None, coarse=None)
+            again = search.but(listings=search.listings + 1, material=None, coarse=None)
             return self._next(again, again.first_step)
         if search.verdict is not None:
             return self._without_attempt(search, failure)
@@ -200,7 +198,7 @@ class QueryStages:
         material = self._material(search)
         if material is None:
             return self._skipped(search)
-        search = replace(search, material=material, coarse=None)
+        search = search.but(material=material, coarse=None)
         if not material.references:
             rejection = Rejection(RejectionReason.NO_USABLE_REFERENCES, material.missing)
             return self._conclude(search, found_by(search.attempt, Answer(rejection), self._doubt, Doubt.REFERENCES))
@@ -236,7 +234,7 @@ class QueryStages:
         if not matcher.is_promising([matches[i] for i in rematched]):
             others = ()
         matched = replace(material, query_matches=tuple(matches), unmatched=others, rematched=rematched)
-        return replace(search, material=matched)
+        return search.but(material=matched)
 
     def _matched(self, search: Search) -> SearchResult:
         """Matches the next reference, or goes on with the query if all are matched or no time is left for more."""
@@ -254,13 +252,13 @@ class QueryStages:
         if search.query.photo.exif is not None and isinstance(prepared, Prepared):
             read = cameras.with_camera(search, prepared)
             if isinstance(read, Material):
-                matched = replace(matched, material=read)
+                matched = matched.but(material=read)
                 prepared = self._prepared(search, read)
             else:
                 prepared = read
         if isinstance(prepared, Rejection):
             return self._conclude(matched, found_by(search.attempt, Answer(prepared), self._doubt))
-        matched = replace(matched, prepared=prepared)
+        matched = matched.but(prepared=prepared)
         return self._next(matched, matched.step(COARSE, prepared.bucket))
 
     def _prepared(self, search: Search, material: Material) -> Prepared | Rejection:
@@ -316,7 +314,7 @@ class QueryStages:
             matches = tuple(matcher.match_quickly(view, references, context.check))
         attributes = choosing.attributes_of(search, scene)
         material = Material(search.attempt.basis, views, view, references, scene, attributes, near, matches)
-        search = replace(search, material=material)
+        search = search.but(material=material)
         given = view, references, self._verdicts.pipeline(search, tier)
         prepared = pipeline.prepare(*given, query.options, context, matches, query.priors)
         if isinstance(prepared, Rejection):
@@ -339,7 +337,7 @@ class QueryStages:
     def _reconstructed(self, search: Search, coarse: Coarse | Exception) -> SearchResult:
         if isinstance(coarse, Exception):
             raise coarse
-        search = replace(search, coarse=coarse, prepared=None)
+        search = search.but(coarse=coarse, prepared=None)
         step = search.step(REFINE)
         is_coarse = search.query.options.variant is Variant.COARSE  # then the coarse pose is the answer
         if search.verdict is not None or is_coarse or not search.query.allow_coarse:
@@ -380,13 +378,12 @@ class QueryStages:
         outcome, material = found.answer.outcome, search.material or search.materials[-1]
         ended = "localized" if isinstance(outcome, Localization) else outcome.reason.value
         before = search.verdict
-        search = replace(
-            search.ended(ended, self._verdicts.tier(search.attempt).features, has_result=True),
+        search = search.ended(ended, self._verdicts.tier(search.attempt).features, has_result=True).but(
             found=(*search.found, found),
             materials=(*search.materials, material),
         )
         verdict = decide(search.found, search.query.priors, search.attributes.unit)
-        search = replace(search, verdict=verdict)
+        search = search.but(verdict=verdict)
         following = self._climb(search)
         is_better = before is None or verdict.outcome is not before.outcome
         is_sent = is_better and isinstance(verdict.outcome, Localization) and isinstance(following, Next)
@@ -402,7 +399,7 @@ class QueryStages:
         if not verdict.doubts:
             return self._done(search)
         if search.pending is None:
-            search = replace(search, pending=tuple(search.source.pending(search.query.scene_key)))
+            search = search.but(pending=tuple(search.source.pending(search.query.scene_key)))
         features = self._verdicts.tier(search.attempt).features
         before = search.before or search.attempt
         now_s = time.monotonic()

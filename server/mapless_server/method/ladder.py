@@ -225,8 +225,10 @@ def further(
     if Doubt.CAMERA in doubts:
         return
     for rung in RUNGS:
+        if not (rung.doubts & doubts and rung.is_possible(before, situation)):
+            continue
         attempt = rung.change(before, situation)
-        if rung.doubts & doubts and rung.is_possible(before, situation) and attempt not in tried:
+        if attempt not in tried:
             # After upright features, those for any roll find less of what is upright than as the first ones.
             at_any_roll = attempt.features == situation.any_roll == before.features > 0
             name = f"{rung.name} at any roll" if at_any_roll else rung.name

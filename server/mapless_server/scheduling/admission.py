@@ -197,8 +197,11 @@ class Ledger:
 
     def _holding(self, flow: Flow) -> tuple["_Holdings", "_Holdings", "_Holdings"]:
         """Returns the holdings of the client, of its caller and of all, to be changed."""
-        of_client = self._clients.setdefault(flow, _Holdings())
-        return of_client, self._callers.setdefault(flow.group, _Holdings()), self._all
+        if (of_client := self._clients.get(flow)) is None:
+            of_client = self._clients[flow] = _Holdings()
+        if (of_caller := self._callers.get(flow.group)) is None:
+            of_caller = self._callers[flow.group] = _Holdings()
+        return of_client, of_caller, self._all
 
     def _forget_if_empty(self, flow: Flow) -> None:
         if self._clients[flow].is_empty:

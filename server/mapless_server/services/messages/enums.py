@@ -4,7 +4,7 @@ from enum import Enum
 from functools import cache
 from typing import Any, TypeVar
 
-from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.descriptor import Descriptor
 from google.protobuf.message import Message
 
 from mapless import wire
@@ -26,13 +26,19 @@ def message_of(value: object, kind: type[MessageT], **others: Any) -> MessageT:
     Enums are converted by their names; None leaves a field empty. AttributeError if the value lacks an attribute.
     """
     descriptor: Any = kind.DESCRIPTOR  # annotated as None
-    given = {it: getattr(value, it.name) for it in descriptor.fields if it.name not in others}
-    fields = {it.name: _number_of(found, it) if isinstance(found, Enum) else found for it, found in given.items()}
+    given = {name: getattr(value, name) for name in _names_of(descriptor) if name not in others}
+    fields = {name: _number_of(it, descriptor, name) if isinstance(it, Enum) else it for name, it in given.items()}
     return kind(**fields, **others)
 
 
-def _number_of(value: Enum, field: FieldDescriptor) -> int:
-    values = field.enum_type.values
+@cache
+def _names_of(message: Descriptor) -> tuple[str, ...]:
+    return tuple(it.name for it in message.fields)
+
+
+@cache
+def _number_of(value: Enum, message: Descriptor, name: str) -> int:
+    values = message.fields_by_name[name].enum_type.values
     return int(next(it.number for it in values if it.name == values[0].name.removesuffix("UNSPECIFIED") + value.name))
 
 
