@@ -56,13 +56,17 @@ def _nodes(message: Message) -> Iterator[Message]:
     """The message and all within it."""
     yield message
     for field, value in message.ListFields():
-        if field.message_type is not None:
+        if field.message_type is not None and not _is_map(field):
             for inner in value if _is_repeated(message, field) else [value]:
                 yield from _nodes(inner)
 
 
 def _is_repeated(message: Message, field: FieldDescriptor) -> bool:
     return hasattr(getattr(message, field.name), "append")
+
+
+def _is_map(field: FieldDescriptor) -> bool:
+    return field.message_type is not None and field.message_type.GetOptions().map_entry
 
 
 @cache
@@ -78,6 +82,8 @@ def _change(message: Message, random: Random, mutate_bytes: MutateBytes) -> None
     field = random.choice(fields)
     if _is_repeated(message, field):
         _change_list(getattr(message, field.name), field, random, mutate_bytes)
+    elif _is_map(field):
+        _change_map(getattr(message, field.name), random)
     elif random.random() < 0.1:
         message.ClearField(field.name)
     elif field.message_type is not None:
@@ -103,6 +109,15 @@ def _change_list(values: Any, field: FieldDescriptor, random: Random, mutate_byt
         values.append(values[chosen])
     else:
         values.append(_other(field.default_value or _empty(field), field, random, mutate_bytes))
+
+
+def _change_map(values: Any, random: Random) -> None:
+    """Texts by texts: adds one, or changes or removes one that there is."""
+    name = random.choice([*values]) if values and random.random() < 0.7 else _other_text("site", random)
+    if name in values and random.random() < 0.3:
+        del values[name]
+    elif len(values) < _MOST_REPEATED:
+        values[name] = _other_text(values.get(name, "a"), random)
 
 
 def _empty(field: FieldDescriptor) -> Any:

@@ -83,7 +83,7 @@ class WatchfulEngine:
     """Finds nothing, and looks at what it is given."""
 
     options = EngineOptions()
-    references = SimpleNamespace(agreements=_NothingCompared())
+    references = SimpleNamespace(agreements=_NothingCompared(), pending=lambda key: ())
 
     def forget_scene(self, key: SceneKey) -> None:
         check_key(key)
@@ -276,7 +276,7 @@ def seeds() -> tuple[bytes, ...]:
     retrieve.position_prior.position_m.x, retrieve.position_prior.radius_m = 1.0, 3.0
     retrieve.heading_prior.direction.x, retrieve.heading_prior.max_angle_deg = 1.0, 60.0
     made = (
-        pb.CreateSceneRequest(scene_id="hall", datum=datum, down_in_world=down),
+        pb.CreateSceneRequest(scene_id="hall", datum=datum, down_in_world=down, labels={"site": "a"}),
         pb.GetSceneRequest(name=scene),
         update,
         pb.ListScenesRequest(page_size=2, page_token=_token(pb.ListScenesRequest(page_size=2))),
