@@ -222,7 +222,7 @@ def test_a_pose_that_own_points_alone_hold_is_not_used() -> None:
     structure = replace(structure, x_in_world=structure.x_in_world[few], tracks=structure.tracks.select(few))
     matches = PointMatches(matches.point[kept], matches.keypoint[kept], matches.guided[kept], 0.0)
     keypoints = scene.query.features.keypoints.copy()
-    keypoints[matches.keypoint] += np.float32([6.0, 0.0])
+    keypoints[matches.keypoint] += np.array([6.0, 0.0], np.float32)
     query = replace(scene.query, features=replace(scene.query.features, keypoints=keypoints))
     estimate = cheated_estimate(scene, matches, scene.world_from_query, error_px=1.0)
     others = [it[~np.isin(it[:, 0], matches.keypoint)] for it in true_correspondences(scene).query_matches]

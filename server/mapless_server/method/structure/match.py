@@ -102,7 +102,8 @@ def search(
     keypoints = query.features.pixels()
     projected = query.camera.project(world_from_query.inverse().apply(structure.x_in_world))
     size = np.array([query.camera.width_px, query.camera.height_px])
-    inside = ((projected > -options.radius_px) & (projected < size + options.radius_px)).all(axis=1)
+    within = (projected > -options.radius_px) & (projected < size + options.radius_px)
+    inside = within[:, 0] & within[:, 1]
     is_free = np.ones(len(keypoints), bool)
     inside[known.point] = is_free[known.keypoint] = False
     free_points, free_keypoints = np.flatnonzero(inside), np.flatnonzero(is_free)
