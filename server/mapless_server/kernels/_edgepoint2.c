@@ -31,12 +31,12 @@ enum { LANES = 16, SIDE = 3, TAPS = SIDE * SIDE, BLOCK = 8, PIXELS = 8, STEP_PX 
 
 /* Sixteen floats, by whatever vectors the processor has. */
 typedef float Lanes __attribute__((vector_size(LANES * sizeof(float))));
+typedef int32_t Mask __attribute__((vector_size(LANES * sizeof(int32_t))));
 
 ALWAYS void load(Lanes *to, const float *from) { memcpy(to, from, sizeof(*to)); }
 ALWAYS void store(float *to, const Lanes *from) { memcpy(to, from, sizeof(*from)); }
-ALWAYS void relu(float *values, Index count) {
-    for (Index i = 0; i < count; i++) values[i] = values[i] > 0 ? values[i] : 0;
-}
+/* By a mask: compilers make a loop over floats of vectors one of single floats. */
+ALWAYS void relu(Lanes *values) { *values = (Lanes)((Mask)*values & (Mask)(*values > 0)); }
 
 /* Where a map is read between its pixels after it is enlarged by a factor: the pixel before, the one after, its share. */
 static void between(Index pixel, Index factor, Index size, Index *before, Index *after, float *share) {
@@ -87,9 +87,8 @@ ALWAYS void convolve(const float *const rows[SIDE], Index stride, Index sources,
         }
     UNROLLED
     for (int k = 0; k < count; k++) {
-        float *its = to + (first + k) * stride + x;
-        store(its, &sums[k]);
-        if (is_relu) relu(its, LANES);
+        if (is_relu) relu(&sums[k]);
+        store(to + (first + k) * stride + x, &sums[k]);
     }
 }
 
@@ -246,8 +245,8 @@ ALWAYS void convolve_groups(const DescriptorHead *head, float *ring, const float
             UNROLLED
             for (int p = 0; p < PIXELS; p++) {
                 if (i + p >= count) continue;
+                relu(&sums[p]);
                 store(to + (i + p) * joint + g * LANES, &sums[p]);
-                relu(to + (i + p) * joint + g * LANES, LANES);
             }
         }
     }

@@ -27,6 +27,12 @@ typedef struct {
     Py_ssize_t count;
 } Descriptors;
 
+#ifdef __clang__
+#define UNROLLED _Pragma("clang loop unroll(full)")
+#else
+#define UNROLLED _Pragma("GCC unroll 16")
+#endif
+
 /* Columns in groups of 16, each four numbers of 16 columns after the other; zeros beyond the last column. */
 typedef struct {
     int8_t *numbers;
@@ -79,6 +85,27 @@ static void reduce_lanes(const float best[COLUMNS], const float second[COLUMNS],
     to->second[row] = next;
 }
 
+/* Products of 8 rows with 16 columns. The sums stay in registers, where compilers keep no array that is indexed by a
+ * variable; around its intrinsic GCC copies each of them twice a step. */
+VNNI static inline __attribute__((always_inline)) void multiply(const uint8_t *rows, const int8_t *columns,
+                                                                const int32_t *minus_bias, Py_ssize_t length,
+                                                                __m512i products[ROWS]) {
+    __m512i sums[ROWS];
+    UNROLLED
+    for (int r = 0; r < ROWS; r++) sums[r] = _mm512_loadu_si512(minus_bias);
+    for (Py_ssize_t k = 0; k < length; k += 4) {
+        const __m512i of_columns = _mm512_loadu_si512(columns + k * COLUMNS);
+        UNROLLED
+        for (int r = 0; r < ROWS; r++) {
+            int32_t of_row;
+            memcpy(&of_row, rows + r * length + k, 4);
+            __asm__("vpdpbusd %2, %1, %0" : "+v"(sums[r]) : "v"(_mm512_set1_epi32(of_row)), "v"(of_columns));
+        }
+    }
+    UNROLLED
+    for (int r = 0; r < ROWS; r++) products[r] = sums[r];
+}
+
 VNNI static void find(const uint8_t *rows, const float *inverse_lengths, Py_ssize_t count, const Packed *columns,
                       Py_ssize_t column_count, Py_ssize_t length, const Maxima *to) {
     const __m512i lanes = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
@@ -89,30 +116,27 @@ VNNI static void find(const uint8_t *rows, const float *inverse_lengths, Py_ssiz
     }
     for (Py_ssize_t i = 0; i < count; i += ROWS) {
         const int used = count - i < ROWS ? (int)(count - i) : ROWS;
-        __m512 best[ROWS], second[ROWS];
+        __m512 best[ROWS], second[ROWS], of_rows[ROWS];
         __m512i at[ROWS];
-        for (int r = 0; r < ROWS; r++) best[r] = second[r] = lowest, at[r] = _mm512_setzero_si512();
+        UNROLLED
+        for (int r = 0; r < ROWS; r++) {
+            best[r] = second[r] = lowest, at[r] = _mm512_setzero_si512();
+            of_rows[r] = _mm512_set1_ps(r < used ? inverse_lengths[i + r] : 0);
+        }
         for (Py_ssize_t g = 0; g < columns->groups; g++) {
-            const int8_t *numbers = columns->numbers + g * COLUMNS * length;
             __m512i products[ROWS];
-            for (int r = 0; r < ROWS; r++) products[r] = _mm512_loadu_si512(columns->minus_bias + g * COLUMNS);
-            for (Py_ssize_t k = 0; k < length; k += 4) {
-                const __m512i of_columns = _mm512_loadu_si512(numbers + k * COLUMNS);
-                for (int r = 0; r < ROWS; r++) {
-                    int32_t of_row;
-                    memcpy(&of_row, rows + (i + r) * length + k, 4);
-                    products[r] = _mm512_dpbusd_epi32(products[r], _mm512_set1_epi32(of_row), of_columns);
-                }
-            }
+            multiply(rows + i * length, columns->numbers + g * COLUMNS * length, columns->minus_bias + g * COLUMNS, length,
+                     products);
             const Py_ssize_t left = column_count - g * COLUMNS;
             const __mmask16 valid = left < COLUMNS ? (__mmask16)((1 << left) - 1) : 0xffff;
             const __m512 inverse = _mm512_loadu_ps(columns->inverse_lengths + g * COLUMNS);
             const __m512i column = _mm512_add_epi32(lanes, _mm512_set1_epi32((int32_t)(g * COLUMNS)));
             __m512 column_best = _mm512_loadu_ps(to->column_best + g * COLUMNS);
             __m512 column_second = _mm512_loadu_ps(to->column_second + g * COLUMNS);
-            for (int r = 0; r < used; r++) {
+            UNROLLED
+            for (int r = 0; r < ROWS; r++) {
                 const __m512 scaled = _mm512_mul_ps(_mm512_cvtepi32_ps(products[r]), inverse);
-                const __m512 cosine = _mm512_mask_mul_ps(lowest, valid, scaled, _mm512_set1_ps(inverse_lengths[i + r]));
+                const __m512 cosine = _mm512_mask_mul_ps(lowest, r < used ? valid : 0, scaled, of_rows[r]);
                 at[r] = _mm512_mask_mov_epi32(at[r], _mm512_cmp_ps_mask(cosine, best[r], _CMP_GT_OQ), column);
                 second[r] = _mm512_max_ps(second[r], _mm512_min_ps(best[r], cosine));
                 best[r] = _mm512_max_ps(best[r], cosine);
@@ -122,7 +146,9 @@ VNNI static void find(const uint8_t *rows, const float *inverse_lengths, Py_ssiz
             _mm512_storeu_ps(to->column_best + g * COLUMNS, column_best);
             _mm512_storeu_ps(to->column_second + g * COLUMNS, column_second);
         }
-        for (int r = 0; r < used; r++) {
+        UNROLLED
+        for (int r = 0; r < ROWS; r++) {
+            if (r >= used) continue;
             float best_of[COLUMNS], second_of[COLUMNS];
             int32_t at_of[COLUMNS];
             _mm512_storeu_ps(best_of, best[r]);
