@@ -138,7 +138,7 @@ def compared(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
 
         return compare
 
-    for module, name in (reference_pairs, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
+    for module, name in (reference_pairs, "mutual_matches_of_ratios"), (matching, "row_maxima"):
         monkeypatch.setattr(module, name, counting(getattr(matching, name)))
     return counts
 

@@ -23,6 +23,7 @@ from mapless_server.method.features.matching import (
     SharedThreads,
     StoredPair,
     mutual_matches,
+    row_maxima,
 )
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.pairs import pair as reference_pairs
@@ -96,6 +97,18 @@ def test_compiled_and_plain_matches_are_the_same(n: int, m: int, monkeypatch: py
             with monkeypatch.context() as plain:
                 plain.setattr(nearest, "is_available", lambda length: False)
                 assert mutual_matches(first, second, 0.99, either).tolist() == compiled.tolist()
+
+
+@pytest.mark.parametrize(
+    ("n", "m", "step"), [(0, 5, 6), (1, 5, 6), (5, 0, 2), (7, 1, 6), (2, 9, 6), (25, 40, 6), (9, 9, 1)]
+)
+def test_matches_of_a_sample_and_the_rest_are_those_of_all(n: int, m: int, step: int) -> None:
+    random = random_for("sample", n, m)
+    first, second = (whole(random.integers(-1, 2, (k, 64))) for k in (n, m))
+    for ours, theirs in (first, second), related(random, n, m, 0.1) if min(n, m) else (first, second):
+        sampled, rest = (row_maxima(some, theirs) for some in (ours.every(step), ours.but_every(step)))
+        expected = mutual_matches(ours, theirs, 0.99).tolist()
+        assert rest.with_every(step, sampled).matches(0.99).tolist() == expected
 
 
 def test_ambiguous_descriptors_are_not_matched() -> None:
@@ -241,7 +254,7 @@ def matched_pairs(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Features, Featu
 
         return compare
 
-    for module, name in (reference_pairs, "mutual_matches_of_ratios"), (matching, "mutual_matches"):
+    for module, name in (reference_pairs, "mutual_matches_of_ratios"), (matching, "row_maxima"):
         monkeypatch.setattr(module, name, spy(getattr(matching, name)))
     return calls
 

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -19,6 +20,8 @@ from mapless_server.scheduling import count_helper, may_have_helpers
 from .limits import EPIPOLAR_PX
 from .views import Features, Matches, PosedView, View
 
+ScalarT = TypeVar("ScalarT", bound=np.generic)
+
 _ROWS_AT_ONCE = 256
 """With 2,000 columns a block has 2 MB, as the second-level cache of a core; BLAS is slower with fewer rows."""
 
@@ -27,14 +30,56 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
     """Mutual nearest neighbours that pass the ratio test from first to second or, if `either`, from second to first."""
     if either:
         return mutual_matches_of_ratios(first, second, (ratio,))[0]
-    if len(first) < 2 or len(second) < 2:
-        return np.empty((0, 2), np.int32)
+    return row_maxima(first, second).matches(ratio)
+
+
+@dataclass(frozen=True, eq=False)
+class RowMaxima:
+    """The two largest cosines of each of N descriptors with M others, and the largest of each of these.
+
+    Attributes:
+        column: (N,) index of the nearest of the others.
+        best, second_best: (N,) float32, its cosine and that of the second-nearest.
+        best_of_column: (M,) float32, largest cosine of each of the others.
+    """
+
+    column: NDArray[np.integer]
+    best: NDArray[np.float32]
+    second_best: NDArray[np.float32]
+    best_of_column: NDArray[np.float32]
+
+    def matches(self, ratio: float) -> Matches:
+        """The mutual nearest neighbours that pass the ratio test."""
+        if len(self.best) < 2 or len(self.best_of_column) < 2:
+            return np.empty((0, 2), np.int32)
+        mutual = self.best >= self.best_of_column[self.column]
+        return _passing(self.column, self.best, self.second_best, mutual, ratio)
+
+    def with_every(self, step: int, others: "RowMaxima") -> "RowMaxima":
+        """Those of all descriptors, if these are of `Features.but_every` and the others of `Features.every`."""
+        rest = np.ones(len(self.best) + len(others.best), bool)
+        rest[::step] = False
+
+        def of_all(ours: NDArray[ScalarT], theirs: NDArray[ScalarT]) -> NDArray[ScalarT]:
+            both = np.empty(len(rest), ours.dtype)
+            both[rest], both[::step] = ours, theirs
+            return both
+
+        return RowMaxima(
+            of_all(self.column, others.column),
+            of_all(self.best, others.best),
+            of_all(self.second_best, others.second_best),
+            np.maximum(self.best_of_column, others.best_of_column),
+        )
+
+
+def row_maxima(first: Features, second: Features) -> RowMaxima:
+    """The nearest of the second photograph's descriptors of each of the first."""
     if (found := _compiled_nearest(first, second)) is not None:
-        mutual = found.best >= found.best_of_column[found.column]
-        return _passing(found.column, found.best, found.second_best, mutual, ratio)
-    nearest, best, second_best = np.empty(len(first), np.intp), *np.empty((2, len(first)), np.float32)
+        return RowMaxima(found.column, found.best, found.second_best, found.best_of_column)
+    nearest, best, second_best = np.zeros(len(first), np.int32), *np.full((2, len(first)), -np.inf, np.float32)
     best_of_column, begin = np.full(len(second), -np.inf, np.float32), 0
-    for cosines in cosine_blocks(first, second):
+    for cosines in cosine_blocks(first, second) if len(second) else ():
         part, rows = slice(begin, begin + len(cosines)), np.arange(len(cosines))
         nearest[part] = cosines.argmax(axis=1)
         best[part] = cosines[rows, nearest[part]]
@@ -42,7 +87,7 @@ def mutual_matches(first: Features, second: Features, ratio: float, either: bool
         cosines[rows, nearest[part]] = -1.0
         second_best[part] = cosines.max(axis=1)
         begin = part.stop
-    return _passing(nearest, best, second_best, best >= best_of_column[nearest], ratio)
+    return RowMaxima(nearest, best, second_best, best_of_column)
 
 
 def mutual_matches_of_ratios(first: Features, second: Features, ratios: Sequence[float]) -> list[Matches]:
@@ -317,12 +362,24 @@ class NearestNeighbours:
 
     def match(self, query: View, references: Sequence[PosedView], check: Callable[[], None]) -> Sequence[Matches]:
         """See QueryMatching.match."""
-        ours = query.features
+        return tuple(self._each(query.features, references, check, partial(mutual_matches, ratio=self.ratio)))
+
+    def compare(self, ours: Features, references: Sequence[PosedView], check: Callable[[], None]) -> list[RowMaxima]:
+        """The nearest descriptors of each reference, of which `matches` makes what `match` returns."""
+        return self._each(ours, references, check, row_maxima)
+
+    def _each(
+        self,
+        ours: Features,
+        references: Sequence[PosedView],
+        check: Callable[[], None],
+        compute: Callable[[Features, Features], ResultT],
+    ) -> list[ResultT]:
         if ours.descriptors.dtype == np.uint8:  # once for all references
             ours = replace(ours, descriptors=ours.unit_descriptors())
 
-        def with_one(reference: PosedView) -> Matches:
+        def with_one(reference: PosedView) -> ResultT:
             check()
-            return mutual_matches(ours, reference.view.features, self.ratio)
+            return compute(ours, reference.view.features)
 
-        return tuple(self._threads.map(with_one, references))
+        return self._threads.map(with_one, references)

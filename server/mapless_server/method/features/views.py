@@ -71,6 +71,12 @@ class Features:
         """The features 0, step, 2 step, ..."""
         return Features(self.keypoints[::step], self.descriptors[::step], self.sizes_px[::step])
 
+    def but_every(self, step: int) -> "Features":
+        """The features that `every` leaves out, in order."""
+        rest = np.ones(len(self), bool)
+        rest[::step] = False
+        return Features(self.keypoints[rest], self.descriptors[rest], self.sizes_px[rest])
+
     @cached_property
     def inverse_lengths(self) -> NDArray[np.float32]:
         """Inverse lengths (N,) of descriptors of int8."""

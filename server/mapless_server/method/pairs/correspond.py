@@ -273,12 +273,17 @@ class Matcher:
         """
         candidates: Sequence[int] = range(len(references))
         if len(references) > count and isinstance(self._query_matching, NearestNeighbours):
-            sample = replace(query, features=query.features.every(self.options.sampled_share))
-            counts = [len(found) for found in self.match_quickly(sample, references, check)]
+            step, compare, ratio = self.options.sampled_share, self._query_matching.compare, self._query_matching.ratio
+            sampled = compare(query.features.every(step), references, check)
+            counts = [len(it.matches(ratio)) for it in sampled]
             chosen = choose(candidates, counts)
             if sum(counts[i] for i in chosen) >= self.options.enough_sampled * len(chosen):
                 candidates = chosen
-        matches = self.match_quickly(query, [references[i] for i in candidates], check)
+            rest = compare(query.features.but_every(step), [references[i] for i in candidates], check)
+            of_all = (it.with_every(step, sampled[i]) for i, it in zip(candidates, rest, strict=True))
+            matches: Sequence[Matches] = [it.matches(ratio) for it in of_all]
+        else:
+            matches = self.match_quickly(query, references, check)
         found = dict(zip(candidates, matches, strict=True))
         return {i: found[i] for i in choose(candidates, [len(it) for it in matches])}
 
