@@ -12,6 +12,11 @@ both errors allow, as at an edge or in a mirror. The final adjustment weighs pla
 smaller the baseline, the more the depth counts. Where the photograph matches mostly triangulated points, these alone
 are used instead of a network's depths.
 
+Triangulated points with too little parallax are dropped (see `structure`). Of those near this bound the ones are left
+that errors of their keypoints made nearer, so they are biased. The depths say how much parallax a point has: where such
+errors may bring it below the bound, the point says nothing of common errors, and lies at its depth if that is more
+certain than the triangulation.
+
 All depths of a photograph share errors of the sensor, or of the network: a factor, and an offset, here in terms of
 the median depth m,
 
@@ -43,7 +48,7 @@ from ..pairs.correspond import Correspondences
 from .match import vote
 from .model import MIN_ADDED_SHARE, DepthPlanes, Structure
 from .observations import keypoint_rays
-from .structure import StructureOptions, observe
+from .structure import StructureOptions, observe, parallaxes_deg
 
 ITERATIONS = 6
 """Steps to the common errors, by reweighted least squares."""
@@ -53,10 +58,6 @@ REGIONS = 20
 
 PLACED_REGIONS = 5
 """The same for points at the depths of a reference, whose errors of the pose they share. Evidence: depth-errors."""
-
-LARGEST_SIGMA = 0.1
-"""Largest relative standard deviation of a triangulated depth that says something of common errors: with larger ones
-those points are left that seem to be near, since others have no parallax."""
 
 AGREEING_SIGMA = 3.0
 """Largest difference of a depth from a triangulated point that it is of, in standard deviations."""
@@ -76,13 +77,20 @@ def with_kept_depths(
     """
     known = _KnownDepths.of(references)
     single = _single_rows(structure, correspondences, known)
-    matched = vote(structure, [len(reference.view.features) for reference in references], correspondences).point
+    counts = [len(reference.view.features) for reference in references]
+    matched = vote(structure, counts, correspondences).point
     if any(it.depths is not None and it.depths.source is DepthSource.MEASURED for it in references):
         min_added_share = 0.0
     if len(single) < min_added_share * len(matched):
         return structure
     observed = _Observed.of(structure, references, known)
     known = _without_common_errors(observed, references, known)
+    poor = observed.poor(known)
+    if len(poor):
+        kept = ~np.isin(np.arange(len(structure.x_in_world)), poor)
+        structure = replace(structure, x_in_world=structure.x_in_world[kept], tracks=structure.tracks.select(kept))
+        observed, single = _Observed.of(structure, references, known), _single_rows(structure, correspondences, known)
+        matched = vote(structure, counts, correspondences).point
     triangulated = observed.agreeing(known, matched)
     if not len(single) + len(triangulated[0]):
         return structure
@@ -131,6 +139,10 @@ class _KnownDepths:
         """The reference of each of these keypoints."""
         return np.searchsorted(self.offsets, rows, side="right") - 1
 
+    def own_variance(self, rows: NDArray[np.intp]) -> Array:
+        """Variances of these depths without what they share, as shares of them."""
+        return np.asarray((self.sigma[rows] / self.depth[rows]) ** 2)
+
     def planes(self, rows: NDArray[np.intp]) -> DepthPlanes:
         """Planes of the points that these keypoints show; all must have a depth."""
         normal, view = self.axis[rows], self.views(rows)
@@ -159,6 +171,7 @@ class _Observed:
         inverse_depth: (O,) of the triangulated point in the reference. Its errors are symmetric, and as large wherever
             along the ray the point came to lie.
         inverse_variance: (O,) its variance.
+        depth_parallax: (O,) depth times parallax, degrees: the same wherever along the ray the point lies.
     """
 
     point: NDArray[np.intp]
@@ -167,6 +180,7 @@ class _Observed:
     keypoint: NDArray[np.intp]
     inverse_depth: Array
     inverse_variance: Array
+    depth_parallax: Array
 
     @staticmethod
     def of(structure: Structure, references: Sequence[PosedView], known: _KnownDepths) -> "_Observed":
@@ -174,24 +188,40 @@ class _Observed:
         row = known.offsets[tracks.view] + tracks.keypoint
         seen = np.flatnonzero(np.isfinite(known.depth[row]))
         point, row = tracks.point[seen], row[seen]
-        covariance = observe(tracks, references, structure.noise).point_covariances(structure.x_in_world)[point]
+        observations, x_in_world = observe(tracks, references, structure.noise), structure.x_in_world
+        covariance, parallax_deg = observations.point_covariances(x_in_world), parallaxes_deg(observations, x_in_world)
         axis = known.axis[row]
-        depth = (axis * (structure.x_in_world[point] - known.centre[row])).sum(axis=1)
-        variance = np.einsum("oi,oij,oj->o", axis, covariance, axis)
-        return _Observed(point, row, tracks.view[seen], tracks.keypoint[seen], 1 / depth, variance / depth**4)
+        depth = (axis * (x_in_world[point] - known.centre[row])).sum(axis=1)
+        variance = np.einsum("oi,oij,oj->o", axis, covariance[point], axis)
+        seen_by = tracks.view[seen], tracks.keypoint[seen]
+        return _Observed(point, row, *seen_by, 1 / depth, variance / depth**4, parallax_deg[point] * depth)
+
+    def is_sure(self, known: _KnownDepths) -> NDArray[np.bool_]:
+        """Whether points at the depths (O,) have so much parallax that no error of their keypoints drops them."""
+        _, variance = self.compared(known)
+        least = self.depth_parallax / known.depth[self.row] * (1 - AGREEING_SIGMA * np.sqrt(variance))
+        return np.asarray(least > StructureOptions.min_parallax_deg)
 
     def compared(self, known: _KnownDepths) -> tuple[Array, Array]:
         """By which shares (O,) the depths are too long, and the variances (O,) of these by the triangulation."""
         depth = known.depth[self.row]
         return depth * self.inverse_depth - 1, depth**2 * self.inverse_variance
 
+    def agrees(self, known: _KnownDepths) -> NDArray[np.bool_]:
+        """Whether the depths (O,) are those of the points."""
+        excess, variance = self.compared(known)
+        return np.asarray(np.abs(excess) < AGREEING_SIGMA * np.sqrt(known.own_variance(self.row) + variance))
+
+    def poor(self, known: _KnownDepths) -> NDArray[np.intp]:
+        """Points that would be dropped if they seemed to be farther, and have an agreeing depth that is more exact."""
+        _, variance = self.compared(known)
+        is_better = known.own_variance(self.row) + known.shared_sigma[self.row] ** 2 < variance
+        return np.unique(self.point[self.agrees(known) & is_better & ~self.is_sure(known)])
+
     def agreeing(self, known: _KnownDepths, among: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """The points (Q,) among some that a depth agrees with, and the row of the most certain one."""
-        excess, variance = self.compared(known)
-        sigma = known.sigma[self.row] / known.depth[self.row]
-        agrees = np.abs(excess) < AGREEING_SIGMA * np.sqrt(sigma**2 + variance)
-        order = np.lexsort((sigma, self.point))
-        order = order[(agrees & np.isin(self.point, among))[order]]
+        order = np.lexsort((known.own_variance(self.row), self.point))
+        order = order[(self.agrees(known) & np.isin(self.point, among))[order]]
         point, first = np.unique(self.point[order], return_index=True)
         return point, self.row[order[first]]
 
@@ -199,9 +229,9 @@ class _Observed:
 def _without_common_errors(observed: _Observed, references: Sequence[PosedView], known: _KnownDepths) -> _KnownDepths:
     """Corrects the depths of each reference by the factor and the offset that triangulated points say they share."""
     depth, sigma, common = known.depth.copy(), known.sigma.copy(), known.common.copy()
-    excess, triangulation = observed.compared(known)
+    (excess, triangulation), is_sure = observed.compared(known), observed.is_sure(known)
     for view, reference in enumerate(references):
-        seen = (observed.view == view) & (triangulation < LARGEST_SIGMA**2)
+        seen = (observed.view == view) & is_sure
         if reference.depths is None or not reference.depths.common_sigma or not seen.any():
             continue
         its = slice(known.offsets[view], known.offsets[view + 1])

@@ -190,11 +190,15 @@ def trustworthy(observations: Observations, x_in_world: Array, options: Structur
     """Mask (P,) of the points that are finite, fit all their observations and have enough parallax."""
     limit = options.max_residual_sigma
     explained = observations.max_by_point(length(observations.residuals(x_in_world).T)) < (limit or np.inf)
+    return np.asarray(explained & (parallaxes_deg(observations, x_in_world) >= options.min_parallax_deg))
+
+
+def parallaxes_deg(observations: Observations, x_in_world: Array) -> Array:
+    """Largest angle (P,) at each point between its first observation and another one, degrees."""
     direction = take(columns(x_in_world), observations.tracks.point) - observations.rays()[0]
     direction = direction / (direction**2).sum(0) ** 0.5
     cosine = (direction * take(direction, observations.tracks.starts[observations.tracks.point])).sum(0)
-    parallax_deg = np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
-    return np.asarray(explained & (observations.max_by_point(parallax_deg) >= options.min_parallax_deg))
+    return observations.max_by_point(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def observe(tracks: Tracks, references: Sequence[PosedView], noise: KeypointNoise) -> Observations:
