@@ -37,6 +37,11 @@ _PAPERS = tuple(wallpaper(seed) for seed in range(3))
 
 def photograph(world_from_camera: RigidTransform, camera: Camera = CAMERA) -> bytes:
     """A PNG of what a camera in the room sees."""
+    return encode(".png", picture(world_from_camera, camera))
+
+
+def picture(world_from_camera: RigidTransform, camera: Camera = CAMERA) -> NDArray[np.uint8]:
+    """The same as (H, W, 3)."""
     columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     rays = camera.rays(np.stack([columns, rows], axis=-1)) @ world_from_camera.rotation.T
     centre = world_from_camera.translation
@@ -44,12 +49,12 @@ def photograph(world_from_camera: RigidTransform, camera: Camera = CAMERA) -> by
         depths = np.where(rays > 1e-9, -centre / rays, np.inf)
     wall = depths.argmin(axis=-1)
     hit = centre + rays * depths.min(axis=-1, keepdims=True)
-    picture = np.zeros((camera.height_px, camera.width_px, 3), np.uint8)
+    shown = np.zeros((camera.height_px, camera.width_px, 3), np.uint8)
     for axis, paper in enumerate(_PAPERS):
         across, down = np.moveaxis(np.delete(hit, axis, axis=-1) * -_TEXELS_PER_M, -1, 0).astype(np.float32)
         found = cv2.remap(paper, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-        picture[wall == axis] = found[wall == axis]
-    return encode(".png", picture)
+        shown[wall == axis] = found[wall == axis]
+    return shown
 
 
 def pose(angle_deg: float, height_m: float = -1.6, distance_m: float = 3.4) -> RigidTransform:
