@@ -1,7 +1,7 @@
 /* Nearest neighbours of descriptors of int8 by their cosines: `nearest`, see nearest.py.
  *
  * The cosine of rows i and j is (float(a_i . b_j) * inverse_length_j) * inverse_length_i. The product of whole numbers
- * is exact, so the twin in Python has the same bits. The matrix of cosines is never stored: a tile of 8 rows and 16
+ * is exact, so the twin in Python has the same bits. The matrix of cosines is never stored: a tile of 16 rows and 16
  * columns is multiplied in registers, and the two largest of each row and column are updated.
  */
 #define PY_SSIZE_T_CLEAN
@@ -15,10 +15,10 @@
 #define HAS_VNNI (__builtin_cpu_supports("avx512vnni") && __builtin_cpu_supports("avx512bw"))
 #define VNNI __attribute__((target("avx512f,avx512bw,avx512vnni")))
 
-enum { ROWS = 8, COLUMNS = 16, LOWEST = -2 /* below any cosine */ };
+enum { ROWS = 16, COLUMNS = 16, LOWEST = -2 /* below any cosine */ };
 
-/* The instruction multiplies unsigned by signed numbers: 128 is added to the first, and 128 times the sum of the second
- * subtracted from the product. */
+/* The instruction multiplies unsigned by signed numbers: 128 is added to those of columns, and 128 times the sum of the
+ * row's subtracted from the product. */
 enum { BIAS = 128 };
 
 typedef struct {
@@ -35,11 +35,16 @@ typedef struct {
 
 /* Columns in groups of 16, each four numbers of 16 columns after the other; zeros beyond the last column. */
 typedef struct {
-    int8_t *numbers;
-    int32_t *minus_bias;
+    uint8_t *numbers;
     float *inverse_lengths;
     Py_ssize_t groups;
 } Packed;
+
+/* Rows in groups of 16, in the same order; zeros beyond the last row. */
+typedef struct {
+    int8_t *numbers;
+    int32_t *minus_bias;
+} Rows;
 
 typedef struct {
     int32_t *nearest;       /* (rows) */
@@ -49,26 +54,31 @@ typedef struct {
 
 static Py_ssize_t rounded_up(Py_ssize_t count, Py_ssize_t step) { return (count + step - 1) / step * step; }
 
-static void pack_columns(const Descriptors *from, Py_ssize_t length, Packed *to) {
+static void pack_columns(const Descriptors *from, Py_ssize_t length, const Packed *to) {
     Py_ssize_t padded = to->groups * COLUMNS;
     memset(to->numbers, 0, padded * length);
-    memset(to->minus_bias, 0, padded * sizeof(int32_t));
     memset(to->inverse_lengths, 0, padded * sizeof(float));
     memcpy(to->inverse_lengths, from->inverse_lengths, from->count * sizeof(float));
     for (Py_ssize_t j = 0; j < from->count; j++) {
         const int8_t *row = from->numbers + j * length;
-        int8_t *group = to->numbers + j / COLUMNS * COLUMNS * length + j % COLUMNS * 4;
-        int32_t sum = 0;
-        for (Py_ssize_t k = 0; k < length; k++) sum += row[k];
-        to->minus_bias[j] = -BIAS * sum;
-        for (Py_ssize_t k = 0; k < length; k += 4) memcpy(group + k * COLUMNS, row + k, 4);
+        uint8_t *group = to->numbers + j / COLUMNS * COLUMNS * length + j % COLUMNS * 4;
+        for (Py_ssize_t k = 0; k < length; k += 4)
+            for (int l = 0; l < 4; l++) group[k * COLUMNS + l] = (uint8_t)(row[k + l] + BIAS);
     }
 }
 
-static void pack_rows(const Descriptors *from, Py_ssize_t length, uint8_t *to) {
-    Py_ssize_t size = from->count * length;
-    for (Py_ssize_t k = 0; k < size; k++) to[k] = (uint8_t)(from->numbers[k] + BIAS);
-    memset(to + size, BIAS, rounded_up(from->count, ROWS) * length - size);
+static void pack_rows(const Descriptors *from, Py_ssize_t length, const Rows *to) {
+    const Py_ssize_t padded = rounded_up(from->count, ROWS);
+    memset(to->numbers, 0, padded * length);
+    memset(to->minus_bias, 0, padded * sizeof(int32_t));
+    for (Py_ssize_t i = 0; i < from->count; i++) {
+        const int8_t *row = from->numbers + i * length;
+        int8_t *group = to->numbers + i / ROWS * ROWS * length + i % ROWS * 4;
+        int32_t sum = 0;
+        for (Py_ssize_t k = 0; k < length; k++) sum += row[k];
+        to->minus_bias[i] = -BIAS * sum;
+        for (Py_ssize_t k = 0; k < length; k += 4) memcpy(group + k * ROWS, row + k, 4);
+    }
 }
 
 /* The largest of all lanes and its column, the first of equal ones; and the second-largest. */
@@ -85,28 +95,27 @@ static void reduce_lanes(const float best[COLUMNS], const float second[COLUMNS],
     to->second[row] = next;
 }
 
-/* Products of 8 rows with 16 columns. The sums stay in registers, where compilers keep no array that is indexed by a
- * variable; around its intrinsic GCC copies each of them twice a step. */
-VNNI static inline __attribute__((always_inline)) void multiply(const uint8_t *rows, const int8_t *columns,
-                                                                const int32_t *minus_bias, Py_ssize_t length,
+/* Products of 16 rows with 16 columns. GCC keeps an array in memory where it is indexed by a variable, and copies each
+ * sum twice a step around its intrinsic, which reads a row's numbers apart. */
+VNNI static inline __attribute__((always_inline)) void multiply(const int8_t *rows, const int32_t *minus_bias,
+                                                                const uint8_t *columns, Py_ssize_t length,
                                                                 __m512i products[ROWS]) {
     __m512i sums[ROWS];
     UNROLLED
-    for (int r = 0; r < ROWS; r++) sums[r] = _mm512_loadu_si512(minus_bias);
+    for (int r = 0; r < ROWS; r++) sums[r] = _mm512_set1_epi32(minus_bias[r]);
     for (Py_ssize_t k = 0; k < length; k += 4) {
         const __m512i of_columns = _mm512_loadu_si512(columns + k * COLUMNS);
         UNROLLED
         for (int r = 0; r < ROWS; r++) {
-            int32_t of_row;
-            memcpy(&of_row, rows + r * length + k, 4);
-            __asm__("vpdpbusd %2, %1, %0" : "+v"(sums[r]) : "v"(_mm512_set1_epi32(of_row)), "v"(of_columns));
+            const int8_t(*of_row)[4] = (const int8_t(*)[4])(rows + k * ROWS + r * 4);
+            __asm__("vpdpbusd %2%{1to16%}, %1, %0" : "+v"(sums[r]) : "v"(of_columns), "m"(*of_row));
         }
     }
     UNROLLED
     for (int r = 0; r < ROWS; r++) products[r] = sums[r];
 }
 
-VNNI static void find(const uint8_t *rows, const float *inverse_lengths, Py_ssize_t count, const Packed *columns,
+VNNI static void find(const Rows *rows, const float *inverse_lengths, Py_ssize_t count, const Packed *columns,
                       Py_ssize_t column_count, Py_ssize_t length, const Maxima *to) {
     const __m512i lanes = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
     const __m512 lowest = _mm512_set1_ps(LOWEST);
@@ -125,7 +134,7 @@ VNNI static void find(const uint8_t *rows, const float *inverse_lengths, Py_ssiz
         }
         for (Py_ssize_t g = 0; g < columns->groups; g++) {
             __m512i products[ROWS];
-            multiply(rows + i * length, columns->numbers + g * COLUMNS * length, columns->minus_bias + g * COLUMNS, length,
+            multiply(rows->numbers + i * length, rows->minus_bias + i, columns->numbers + g * COLUMNS * length, length,
                      products);
             const Py_ssize_t left = column_count - g * COLUMNS;
             const __mmask16 valid = left < COLUMNS ? (__mmask16)((1 << left) - 1) : 0xffff;
@@ -162,21 +171,19 @@ VNNI static void find(const uint8_t *rows, const float *inverse_lengths, Py_ssiz
 /* False without memory. */
 static int find_nearest(const Descriptors *first, const Descriptors *second, Py_ssize_t length, const Maxima *to) {
     const Py_ssize_t groups = rounded_up(second->count, COLUMNS) / COLUMNS, padded = groups * COLUMNS;
-    const Py_ssize_t row_bytes = rounded_up(first->count, ROWS) * length;
-    uint8_t *memory = malloc(row_bytes + padded * (length + sizeof(int32_t) + 3 * sizeof(float)));
-    if (memory == NULL) return 0;
-    float *floats = (float *)memory; /* what needs alignment comes first */
-    Packed columns = {.inverse_lengths = floats, .minus_bias = (int32_t *)(floats + 3 * padded), .groups = groups};
-    columns.numbers = (int8_t *)(columns.minus_bias + padded);
-    uint8_t *rows = (uint8_t *)columns.numbers + padded * length;
+    const Py_ssize_t count = rounded_up(first->count, ROWS);
+    float *floats = malloc(padded * (length + 3 * sizeof(float)) + count * (length + sizeof(int32_t)));
+    if (floats == NULL) return 0;
+    const Rows rows = {(int8_t *)(floats + 3 * padded + count), (int32_t *)(floats + 3 * padded)};
+    Packed columns = {(uint8_t *)rows.numbers + count * length, floats, groups};
     Maxima found = *to;
     found.column_best = floats + padded, found.column_second = floats + 2 * padded;
     pack_columns(second, length, &columns);
-    pack_rows(first, length, rows);
-    find(rows, first->inverse_lengths, first->count, &columns, second->count, length, &found);
+    pack_rows(first, length, &rows);
+    find(&rows, first->inverse_lengths, first->count, &columns, second->count, length, &found);
     memcpy(to->column_best, found.column_best, second->count * sizeof(float));
     memcpy(to->column_second, found.column_second, second->count * sizeof(float));
-    free(memory);
+    free(floats);
     return 1;
 }
 
