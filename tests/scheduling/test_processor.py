@@ -1,5 +1,6 @@
 """Threads that give way: how long they pause, on a clock of the test's own."""
 
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -32,7 +33,12 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return it
 
 
-def pauses_s(clock: Clock, steps_s: list[float], others_compute: Callable[[], bool] | None) -> list[float]:
+def pauses_s(
+    clock: Clock,
+    steps_s: list[float],
+    others_compute: Callable[[], bool] | None,
+    longest_s: float = LONGEST_PAUSE_S,
+) -> list[float]:
     """The pause after each step of a thread, of low priority unless it is None."""
 
     def computed() -> list[float]:
@@ -42,7 +48,7 @@ def pauses_s(clock: Clock, steps_s: list[float], others_compute: Callable[[], bo
         for step_s in steps_s:
             clock.compute(step_s)
             begin_s = clock.now_s
-            give_way()
+            give_way(longest_s)
             found.append(clock.now_s - begin_s)
         return found
 
@@ -59,6 +65,10 @@ def test_a_long_pause_is_made_in_parts(clock: Clock) -> None:
     """The thread may hold a lock."""
     pauses = pauses_s(clock, [0.1, 0.0, 0.0], lambda: True)
     assert pauses == pytest.approx([LONGEST_PAUSE_S, 0.9 - LONGEST_PAUSE_S, 0.0], abs=0.011)
+
+
+def test_between_steps_the_whole_pause_is_made(clock: Clock) -> None:
+    assert pauses_s(clock, [1.0, 0.0], lambda: True, math.inf) == pytest.approx([9.0, 0.0], abs=0.011)
 
 
 def test_a_pause_ends_when_no_others_compute_any_more(clock: Clock) -> None:

@@ -46,5 +46,5 @@ from .jobs import (
     StageResult,
     Step,
 )
-from .processor import count_helper, may_have_helpers, processor_s
+from .processor import count_helper, give_way, may_have_helpers, processor_s
 from .work_queue import Failure, Fatal, WorkQueue

@@ -7,7 +7,8 @@ from collections.abc import Callable
 SHARE_BESIDE_OTHERS = 0.1
 """Share of a core that a thread that gives way takes while others compute. Evidence: lost-robots."""
 LONGEST_PAUSE_S = 0.5
-"""A pause ends after this time: the thread may hold what others wait for. The rest is left for the next one."""
+"""A pause in the middle of a step ends after this time: the thread may hold what others wait for. The rest is left for
+the next one."""
 _LOOK_S = 0.01
 
 
@@ -48,10 +49,10 @@ def lower_priority(others_compute: Callable[[], bool]) -> None:
     _thread.computed_s = time.thread_time()
 
 
-def give_way() -> None:
+def give_way(longest_s: float = LONGEST_PAUSE_S) -> None:
     """Pauses a thread of low priority while others compute, as long as its share demands; returns at once in others.
 
-    What it computes while no others do is not counted.
+    What it owes is forgotten when no others compute.
     """
     others_compute = _thread.others_compute
     if others_compute is None:
@@ -59,7 +60,7 @@ def give_way() -> None:
     spent_s = time.thread_time() - _thread.computed_s
     _thread.owed_s += spent_s * (1 / SHARE_BESIDE_OTHERS - 1)
     begin_s = now_s = time.monotonic()
-    until_s = begin_s + min(_thread.owed_s, LONGEST_PAUSE_S)
+    until_s = begin_s + min(_thread.owed_s, longest_s)
     while now_s < until_s and others_compute():
         time.sleep(_LOOK_S)
         now_s = time.monotonic()

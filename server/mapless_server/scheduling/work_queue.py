@@ -26,7 +26,7 @@ from .jobs import (
     StageLoad,
     ValueT,
 )
-from .processor import lower_priority, processor_s
+from .processor import give_way, lower_priority, processor_s
 from .scheduler import Scheduler
 
 log = logging.getLogger(__name__)
@@ -322,6 +322,7 @@ class WorkQueue:
                     self._notify(crew)
                 # An idle thread must not keep photographs and tensors alive.
                 del batch, results
+                give_way(math.inf)
         except BaseException as error:  # SystemExit too: the queue must not go on without this thread
             self._loop.call_soon_threadsafe(self._fail, error)
 

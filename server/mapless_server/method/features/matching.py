@@ -15,7 +15,7 @@ from mapless_server.bounds import check_bounds
 from mapless_server.choices import EDGEPOINT2
 from mapless_server.kernels import nearest
 from mapless_server.kernels.nearest import Nearest, Whole
-from mapless_server.scheduling import count_helper, may_have_helpers
+from mapless_server.scheduling import count_helper, give_way, may_have_helpers
 
 from .limits import EPIPOLAR_PX
 from .views import Features, Matches, PosedView, View
@@ -327,6 +327,7 @@ class SharedThreads:
         def work() -> None:
             try:
                 for i, item in rest:
+                    give_way()
                     results[i] = compute(item)
             except BaseException:
                 deque(rest, 0)
