@@ -33,7 +33,7 @@ from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.query import CutReason, MissingEvidence, Photo, Result, Tier
 from mapless_server.engine.search import SearchJob
 from mapless_server.engine.stages import MAX_LISTINGS
-from mapless_server.errors import InvalidArgument, Unavailable
+from mapless_server.errors import InvalidArgument, NotFound, Unavailable
 from mapless_server.method.features.views import PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.judge import LEVELS, JudgeOptions
@@ -246,6 +246,19 @@ class TestTiers:
         answered.set()
         assert (result.tier.extractor.name, [it.reason for it in result.cuts]) == ("cheap", [CutReason.NO_TIME])
         assert result.missing == (MissingEvidence("matches", "strong (network)", 7),)
+
+    @pytest.mark.parametrize("error", [Unavailable("the store is away"), NotFound("the scene is gone", field="scene")])
+    def test_a_doubtful_answer_is_given_without_the_store(
+        self, setting: Setting, error: Exception, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        def away(_: object) -> list[Pending]:
+            raise error
+
+        setting.replies = dict.fromkeys(("cheap", "strong"), localized(DOUBTFUL_INLIERS))
+        setting.engine.references.pending = away
+        result = setting.localize()
+        assert isinstance(result.answer.outcome, Localization)
+        assert (result.missing, caplog.text.count(str(error))) == ((), 1)
 
     def test_tiers_share_neither_names_nor_what_remembers_matches(self, setting: Setting) -> None:
         cheap, strong = setting.engine.tiers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections import Counter
@@ -10,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from mapless_server.engine.photo_views import QueryViews
+from mapless_server.errors import RequestError
 from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.judge.hypothesis import Attempt, Where, first_attempt
 from mapless_server.method.options import ChosenCamera, StageContext
@@ -26,6 +28,8 @@ if TYPE_CHECKING:  # services need not load what computes
     from mapless_server.method.judge.decide import Verdict
     from mapless_server.method.judge.hypothesis import Found
     from mapless_server.method.pipeline import Coarse, Prepared
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +212,20 @@ class Search:
         """Whether references elsewhere would be chosen without soft priors."""
         can_be = self.material is not None and self.material.choice is not None and not self.query.is_part
         return can_be and self.query.narrowing.has_likely
+
+    def knowing_pending(self) -> Search:
+        """The search with what the background has still to make in the scene.
+
+        Nothing is known of that while the store is away or after the scene was deleted: the answer is given without it.
+        """
+        if self.pending is not None:
+            return self
+        scene_key, pending = self.query.scene_key, tuple[Pending, ...]()
+        try:
+            pending = tuple(self.source.pending(scene_key))
+        except RequestError as error:
+            log.warning("what the background has to make in scene %s is not known: %s", scene_key, error)
+        return self.but(pending=pending)
 
     def ended(self, outcome: str, features: str, has_result: bool = False) -> Search:
         """The search after the present attempt, which took the time since it began."""

@@ -398,8 +398,7 @@ class QueryStages:
             return self._next(first, first.first_step)
         if not verdict.doubts:
             return self._done(search)
-        if search.pending is None:
-            search = search.but(pending=tuple(search.source.pending(search.query.scene_key)))
+        search = search.knowing_pending()
         features = self._verdicts.tier(search.attempt).features
         before = search.before or search.attempt
         now_s = time.monotonic()
