@@ -37,24 +37,24 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	$(INSTALL) --no-deps --target $(VENV)/kapture $(KAPTURE)
 	touch $@
 
-setup: $(VENV)/.installed  ## Create .venv with everything
-
-lock: $(VENV)/.installed  ## Write the versions of all packages anew after a change of pyproject.toml; UPGRADE=1 for the newest
-	$(BIN)/python .ci/lock.py $(TORCH_VERSION) $(if $(UPGRADE),--upgrade)
-	cd client/web && npm install --package-lock-only --ignore-scripts --no-audit --no-fund
-
 # The modules that are compiled, in place. Without a compiler numpy computes the same in more time.
 COMPILED := $(patsubst %.c,%.abi3.so,$(wildcard server/mapless_server/kernels/*.c))
 $(COMPILED): setup.py $(wildcard server/mapless_server/kernels/*.c) $(VENV)/.installed
 	$(BIN)/python setup.py --quiet build_ext --inplace
 	test ! -e $@ || touch $@
 
+setup: $(VENV)/.installed $(COMPILED)  ## Create .venv with everything
+
+lock: $(VENV)/.installed  ## Write the versions of all packages anew after a change of pyproject.toml; UPGRADE=1 for the newest
+	$(BIN)/python .ci/lock.py $(TORCH_VERSION) $(if $(UPGRADE),--upgrade)
+	cd client/web && npm install --package-lock-only --ignore-scripts --no-audit --no-fund
+
 # The matrices are small: threads gain nothing, and wait for one another where cores are shared. Not so the full networks.
 THREADS ?= 1
 # Three processes, for tests of servers wait a quarter of their time: two use 1.5 of two cores. The one that has finished takes
 # over tests of the others; WORKERS= for one process.
 WORKERS ?= -n 3 --dist worksteal
-tools: setup $(COMPILED) $(PROTO_VENV)/.installed  ## Install all that tests need
+tools: setup $(PROTO_VENV)/.installed  ## Install all that tests need
 
 test: tools  ## Run the tests in at most five minutes; ARGS=... for pytest
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=$(THREADS) PROTO_PYTHON=$(PROTO_VENV)/bin/python $(BIN)/python -m pytest $(WORKERS) $(ARGS)

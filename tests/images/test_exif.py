@@ -139,6 +139,16 @@ def test_pillow_is_not_asked_where_a_jpeg_has_no_segment_for_exif(
     assert (upright_of(plain.getvalue()), read_exif(plain.getvalue())) == (Upright(), NO_EXIF)
 
 
+@pytest.mark.parametrize(("count", "is_read"), [(998, True), (1000, False)])
+def test_exif_after_a_thousand_segments_is_not_read(count: int, is_read: bool) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = "Planted"
+    out = io.BytesIO()
+    Image.new("RGB", (40, 30)).save(out, "JPEG", exif=exif)
+    start, rest = out.getvalue()[:2], out.getvalue()[2:]
+    assert (read_exif(start + b"\xff\xe2\x00\x02" * count + rest).make == "Planted") == is_read
+
+
 @pytest.mark.parametrize("ending", [".png", ".webp"])
 def test_all_formats_say_which_way_is_up(ending: str) -> None:
     exif, out = Image.Exif(), io.BytesIO()

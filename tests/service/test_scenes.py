@@ -83,7 +83,7 @@ def test_scenes_are_grouped_by_labels(client: Client) -> None:
         ({"n" * 65: "1"}, "1 to 64"),
         ({"site": ""}, "1 to 128"),
         ({"site": "v" * 129}, "1 to 128"),
-        ({"site": "a\nb"}, "printable"),
+        ({"site": "a\nb"}, "control character"),
         ({f"n{i}": "1" for i in range(33)}, "at most 32 labels, has 33"),
     ],
 )

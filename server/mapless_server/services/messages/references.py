@@ -3,6 +3,7 @@
 import base64
 import binascii
 import re
+import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -195,8 +196,8 @@ def labels_from_message(labels: Mapping[str, str], field: str) -> dict[str, str]
     for name, value in labels.items():
         if not _LABEL_NAME.fullmatch(name):
             raise FieldError(field, f"must have names of 1 to 64 of A-Z a-z 0-9 . _ -, has {names.shown(name)}")
-        if not 1 <= len(value) <= MAX_LABEL_VALUE or not value.isprintable():
-            bounds = f"1 to {MAX_LABEL_VALUE} printable characters"
+        if not 1 <= len(value) <= MAX_LABEL_VALUE or any(unicodedata.category(it) == "Cc" for it in value):
+            bounds = f"1 to {MAX_LABEL_VALUE} characters, none of them a control character"
             raise FieldError(field, f"must have values of {bounds}, {name!r} has {names.shown(value)}")
     return dict(labels)
 
