@@ -20,7 +20,8 @@ from mapless_server.method.bundle.priors import (
     Priors,
     conflict_threshold,
 )
-from mapless_server.method.optim.optimize import moved, rotation_vector
+from mapless_server.method.optim.optimize import moved
+from mapless_server.method.optim.rotations import rotation_vector
 
 POSE = RigidTransform(rotation_from_vector([0.2, -0.3, 0.1]), np.array([0.4, -0.2, -4.0]))
 DOWN = np.array([0.0, 0.0, -1.0])

@@ -26,7 +26,8 @@ from mapless_server.method.bundle.shutter import (
 )
 from mapless_server.method.features.views import Features, View, undistort_pixels
 from mapless_server.method.localize import localize
-from mapless_server.method.optim.optimize import perturbed, rotation_vector
+from mapless_server.method.optim.optimize import perturbed
+from mapless_server.method.optim.rotations import rotation_vector
 from mapless_server.method.options import LocalizeOptions, Variant
 from mapless_server.method.pose.with_priors import refine_pose
 

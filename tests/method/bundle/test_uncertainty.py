@@ -52,14 +52,8 @@ from mapless_server.method.bundle.pose_problem import (
     pose_errors,
 )
 from mapless_server.method.judge.evidence import evidence_of, votes_of
-from mapless_server.method.optim.optimize import (
-    motion_jacobian,
-    moved,
-    pose_hessian,
-    rotation_vector,
-    world_covariance,
-    world_jacobian,
-)
+from mapless_server.method.optim.optimize import motion_jacobian, moved, pose_hessian, world_covariance, world_jacobian
+from mapless_server.method.optim.rotations import rotation_vector
 from mapless_server.method.pose.pnp import PnpOptions, solve_pose
 from mapless_server.method.structure.model import Structure
 

@@ -22,7 +22,7 @@ from mapless_server.method.groups.rig import RigEstimate, RigState, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.groups.start import CHECK_TRACKING
 from mapless_server.method.judge.answer import Answer, Localization
-from mapless_server.method.optim.optimize import rotation_vector
+from mapless_server.method.optim.rotations import rotation_vector
 from mapless_server.method.pose.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from mapless_server.method.pose.pnp import PnpOptions
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason

@@ -28,7 +28,8 @@ from mapless_server.method.judge.two_view import (
     two_view_trust,
 )
 from mapless_server.method.localize import localize
-from mapless_server.method.optim.optimize import moved, rotation_vector
+from mapless_server.method.optim.optimize import moved
+from mapless_server.method.optim.rotations import rotation_vector
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pairs.correspond import Correspondences, Matcher
 from mapless_server.method.pairs.epipolar import sampson_px

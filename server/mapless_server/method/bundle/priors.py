@@ -24,7 +24,7 @@ import numpy as np
 from mapless.geometry import Array, Camera, RigidTransform, cross_matrix
 from mapless_server.bounds import check_bounds
 
-from ..optim.optimize import rotation_vector
+from ..optim.rotations import rotation_vector
 
 CONFLICT_PROBABILITY = 1e-4
 """Probability that a consistent prior is taken for one in conflict."""

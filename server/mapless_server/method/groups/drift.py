@@ -15,7 +15,8 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
-from ..optim.optimize import perturbed, rotation_vector, switched_cost, switched_weight
+from ..optim.optimize import perturbed, switched_cost, switched_weight
+from ..optim.rotations import rotation_vector
 
 _MEDIAN_SQUARE = 5.35
 """Median of a chi-square of six degrees of freedom."""

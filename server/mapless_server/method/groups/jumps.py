@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
 from ..bundle.priors import conflict_threshold
-from ..optim.optimize import rotation_vector
+from ..optim.rotations import rotation_vector
 from .drift import step_sigma, step_size
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform
 
 from ..bundle.readout import RollingShutter, TrackedMotion
-from ..optim.optimize import rotation_vector
+from ..optim.rotations import rotation_vector
 
 CORRELATION_S = 0.5
 """Time after which the velocity of a hand or a robot has changed by most of itself. Evidence: rolling-shutter."""

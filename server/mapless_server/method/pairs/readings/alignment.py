@@ -22,7 +22,8 @@ from mapless.geometry import Array, Similarity, cross_matrix, rotation_angle_deg
 
 from ...features.limits import LOSS_SCALE_PX
 from ...features.views import PosedView
-from ...optim.optimize import MinimizeOptions, damped_step, minimize, rotation_vector, soft_l1, soft_l1_weight
+from ...optim.optimize import MinimizeOptions, damped_step, minimize, soft_l1, soft_l1_weight
+from ...optim.rotations import rotation_vector
 from .errors import FEW_SHARE, SAMPLED_MATCHES, MatchedPair, PairSample, Views, summary
 
 MOST_PAIRS = 24
