@@ -13,6 +13,7 @@ from mapless import Rejected, RigidTransform, Unavailable
 from mapless.answers import Accuracy
 from mapless.geometry import Similarity, rotation_angle_deg, rotation_from_vector
 from mapless.groups import ImageReport, SequenceFrame, SequenceLocalization
+from mapless.requests import IntrinsicsUncertainty
 from mapless.ros import Localizer, LocalizerOptions, RosCamera, pose_of_body
 
 MAP_FROM_ODOM = RigidTransform(rotation_from_vector([0.0, 0.0, 1.2]), np.array([5.0, -3.0, 0.1]))
@@ -257,10 +258,29 @@ def test_a_rejected_image_is_localized_with_those_before(client: PlantedClient) 
     assert len(sent) == 1
 
 
+def test_each_image_has_the_shutter_of_the_options(client: PlantedClient) -> None:
+    sent, answered = list[Any](), client.localize
+
+    def noted(*positional: Any, **named: Any) -> Any:
+        sent.append(named["intrinsics_uncertainty"])
+        return answered(*positional, **named)
+
+    client.localize = noted  # type: ignore[method-assign]
+    make(client).localize(shot(1.0), RosCamera(CAMERA))
+    shutter: dict[str, Any] = {"readout_s": 0.02, "readout_direction": "bottom_to_top"}
+    shutter |= {"speed_m_per_s": 1.5, "turn_deg_per_s": 30.0}
+    make(client, **shutter).localize(shot(1.0), RosCamera(CAMERA))
+    assert sent == [None, IntrinsicsUncertainty(**shutter)]
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
         ({"readout_s": 33.0}, "readout_s must be 0 to 0.2 s, is 33"),
+        ({"readout_s": 0.02, "readout_direction": "up"}, "readout_direction must be one of top_to_bottom, .*'up'"),
+        ({"readout_s": 0.02, "speed_m_per_s": -1.0}, "speed_m_per_s must be 0 to 1000 m/s, is -1"),
+        ({"readout_s": 0.02, "turn_deg_per_s": float("nan")}, "turn_deg_per_s must be 0 to 3600 degrees/s, is nan"),
+        ({"turn_deg_per_s": 30.0}, "turn_deg_per_s is of a rolling shutter, and readout_s is 0"),
         ({"sequence_length": 1}, "sequence_length must be 0 or 2 to 16 images, is 1"),
         ({"sequence_length": 4, "odom_frame": ""}, "sequence_length needs odom_frame"),
         ({"map_frame": "odom"}, "map_frame"),

@@ -29,6 +29,7 @@ from support.waiting import wait_until
 
 from mapless import Client
 from mapless.ros import transform_from_message, transform_from_pose
+from mapless_server.method.bundle.readout import ReadoutDirection, RollingShutter
 
 PACKAGE = Path(__file__).parents[2] / "deploy" / "ros2" / "mapless_ros"
 
@@ -102,6 +103,7 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
     with serving(tmp_path / "data") as server, Client(server.address) as client:
         make_scene(client, "hall", 2)
         given = {"address": server.address, "scene": "hall", "compressed": True, "depth": True}
+        given |= {"readout_s": 0.02, "readout_direction": "left_to_right", "speed_m_per_s": 1.5, "turn_deg_per_s": 30.0}
         monkeypatch.setattr(StandInNode, "parameters", given)
         node = node_module.MaplessNode()
         poses, reports = node.published["visual_localization/pose"], node.published["/diagnostics"]
@@ -123,6 +125,8 @@ def test_the_node_publishes_pose_transform_and_diagnostics(
             found = transform_from_pose(poses[0].pose.pose)
             np.testing.assert_allclose(found.translation - map_from_base.translation, 0, atol=1e-9)
             assert poses[0].header.frame_id == "map"
+            shutter = RollingShutter(0.02, ReadoutDirection.LEFT_TO_RIGHT, 1.5, 30.0)
+            assert server.method.options[-1].shutter == shutter
             assert np.linalg.eigvalsh(np.reshape(poses[0].pose.covariance, (6, 6))).min() > 0
             assert reports[0].status[0].level == 0
             assert {it.key: it.value for it in reports[0].status[0].values}["depth"] == "sent"

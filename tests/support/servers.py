@@ -112,6 +112,7 @@ class StandInMethod:
         gate: calls wait here; open unless a test closes it.
         started: released by every call that begins.
         failure: raised instead of an answer.
+        options: those of each call.
     """
 
     inlier_count: int = 90
@@ -120,6 +121,7 @@ class StandInMethod:
     started: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     failure: Exception | None = None
     call_count: int = 0
+    options: list[LocalizeOptions] = field(default_factory=list)
 
     def __call__(
         self,
@@ -130,6 +132,7 @@ class StandInMethod:
         check: Callable[[], None],
     ) -> Answer:
         self.call_count += 1
+        self.options.append(options)
         self.started.release()
         assert self.gate.wait(60)
         if self.failure is not None:

@@ -16,7 +16,7 @@ from mapless.errors import MaplessError
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless.groups import SequenceFrame, SequenceLocalization
 from mapless.priors import PosePrior, Priors
-from mapless.requests import ImageSource, IntrinsicsUncertainty, read_mask
+from mapless.requests import ImageSource, IntrinsicsUncertainty, ReadoutDirection, read_mask
 
 from .cameras import RosCamera
 from .depths import RosDepth
@@ -40,8 +40,8 @@ LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.02, 0.01
 ODOMETRY_DRIFT = 0.1
 """Standard deviation of odometry, as a share of the way and the angle: wheels slip."""
 
-MAX_READOUT_S = 0.2
-"""Longest read-out that servers take."""
+MAX_READOUT_S, MAX_SPEED_M_PER_S, MAX_TURN_DEG_PER_S = 0.2, 1000.0, 3600.0
+"""Longest read-out and largest speeds that servers take."""
 
 SPEED_M_S, TURN_RAD_S, GUESS_LIFE_S = 1.5, 1.5, 5.0
 """Without odometry: how fast a robot may have moved since, and how long its last pose says anything."""
@@ -65,6 +65,9 @@ class LocalizerOptions:
             together, by the odometry between them; 0 for never. This takes as long as localizing all of them.
         mask: a PNG of the camera's size that is 0 where the camera sees the robot itself, or its path; None for none.
         readout_s: seconds that a rolling shutter takes from the first row to the last one; 0 for a global shutter.
+        readout_direction: the side of the images that it reads first.
+        speed_m_per_s, turn_deg_per_s: standard deviations of each component of the camera's speed and angular speed
+            while it moves; 0 for the server's defaults.
     """
 
     scene: str
@@ -78,6 +81,9 @@ class LocalizerOptions:
     sequence_length: int = 0
     mask: ImageSource | None = None
     readout_s: float = 0.0
+    readout_direction: ReadoutDirection | str = ReadoutDirection.TOP_TO_BOTTOM
+    speed_m_per_s: float = 0.0
+    turn_deg_per_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.scene:
@@ -88,12 +94,37 @@ class LocalizerOptions:
             raise ValueError(f"rate must be 0 to 1000 images a second, is {self.rate_hz:g}")
         if not self.timeout_s > 0:
             raise ValueError(f"timeout must be above 0 s, is {self.timeout_s:g}")
-        if not 0 <= self.readout_s <= MAX_READOUT_S:
-            raise ValueError(f"readout_s must be 0 to {MAX_READOUT_S:g} s, is {self.readout_s:g}")
+        self._check_shutter()
         if self.sequence_length not in (0, *range(2, 17)):
             raise ValueError(f"sequence_length must be 0 or 2 to 16 images, is {self.sequence_length}")
         if self.sequence_length and not self.odom_frame:
             raise ValueError("sequence_length needs odom_frame: sequences are images with the odometry between them")
+
+    def _check_shutter(self) -> None:
+        for name, value, most, unit in (
+            ("readout_s", self.readout_s, MAX_READOUT_S, "s"),
+            ("speed_m_per_s", self.speed_m_per_s, MAX_SPEED_M_PER_S, "m/s"),
+            ("turn_deg_per_s", self.turn_deg_per_s, MAX_TURN_DEG_PER_S, "degrees/s"),
+        ):
+            if not 0 <= value <= most:
+                raise ValueError(f"{name} must be 0 to {most:g} {unit}, is {value:g}")
+            if value and not self.readout_s:
+                raise ValueError(f"{name} is of a rolling shutter, and readout_s is 0")
+        known = [it.value for it in ReadoutDirection]
+        if self.readout_direction not in known:
+            raise ValueError(f"readout_direction must be one of {', '.join(known)}, is {self.readout_direction!r}")
+
+    @property
+    def uncertainty(self) -> IntrinsicsUncertainty | None:
+        """The read-out of the images' shutter, for a request; None for a global shutter."""
+        if not self.readout_s:
+            return None
+        return IntrinsicsUncertainty(
+            readout_s=self.readout_s,
+            readout_direction=self.readout_direction,
+            speed_m_per_s=self.speed_m_per_s,
+            turn_deg_per_s=self.turn_deg_per_s,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +170,7 @@ class Localizer:
         self._client = client
         self._options = options
         self._mask = read_mask(options.mask)
-        self._uncertainty = IntrinsicsUncertainty(readout_s=options.readout_s) if options.readout_s else None
+        self._uncertainty = options.uncertainty
         self._lookup = lookup
         self._lock = threading.Lock()
         self._guess: _Guess | None = None

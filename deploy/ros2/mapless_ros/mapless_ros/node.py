@@ -40,6 +40,9 @@ PARAMETERS: dict[str, Any] = {
     "sequence_length": 0,
     "mask": "",
     "readout_s": 0.0,
+    "readout_direction": "top_to_bottom",
+    "speed_m_per_s": 0.0,
+    "turn_deg_per_s": 0.0,
     "depth": False,
     "depth_compressed": False,
     "depth_sensor": "unknown",
@@ -77,6 +80,9 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
             sequence_length=self._given["sequence_length"],
             mask=self._given["mask"] or None,
             readout_s=self._given["readout_s"],
+            readout_direction=self._given["readout_direction"],
+            speed_m_per_s=self._given["speed_m_per_s"],
+            turn_deg_per_s=self._given["turn_deg_per_s"],
         )
         self._client = mapless.Client(self._given["address"], self._connect_options())
         self._tf = tf2_ros.Buffer()
