@@ -496,6 +496,26 @@ class TestPriority:
             server.background.close()
         assert done == ["calibrated with 0 pairs"]
 
+    def test_many_first_calibrations_leave_references_their_turn(self, store: Store) -> None:
+        class Stages:
+            def __init__(self) -> None:
+                self.count = 0
+
+            def calibrate_next(self, pause: Callable[[], None], is_first: bool = False) -> bool:
+                self.count += is_first
+                assert self.count <= 100, "references are not matched"
+                return True
+
+            def maintain(self) -> None:
+                pass
+
+            kind = "a kind"
+
+        calibrations: Any = Stages()
+        server = Server(store, kinds=[Matching.STRICT], work=SceneWork(calibrations))
+        server.background.match_waiting()
+        assert (server.counts.waits, calibrations.count) == (0, 6)
+
     def test_a_busy_server_with_slow_pairs_ends_too(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         """The wait for its share would be longer than a claim holds."""
         monkeypatch.setattr("mapless_server.scenes.background.CLAIM_S", 0.02)

@@ -79,21 +79,28 @@ def test_a_first_calibration_leaves_the_scene_due(store: Store) -> None:
     assert claim_scene(store.database, KIND) is not None
 
 
-def test_a_first_calibration_is_made_again_when_a_scene_doubles(store: Store) -> None:
+def test_a_first_calibration_is_made_again_when_references_double(store: Store) -> None:
     store.add_references(OFFICE, [make_reference("c", 3)])
-    begin = store.get_generation(OFFICE)
     first = claim_scene(store.database, KIND, is_first=True)
     assert first is not None
+    store.add_references(OFFICE, [make_reference("too late", 4)])
     add(store, first, of(store), 0.0, is_first=True)
-    for i in range(begin):
-        assert claim_scene(store.database, KIND, is_first=True) is None
-        store.add_references(OFFICE, [make_reference(f"more-{i}", 4 + i)])
+    for _ in range(9):
+        store.update_scene(OFFICE, down_in_world=(0.0, 0.0, -1.0))
+    assert claim_scene(store.database, KIND, is_first=True) is None
+    store.add_references(OFFICE, [make_reference(f"more-{i}", 5 + i) for i in range(2)])
     again = claim_scene(store.database, KIND, is_first=True)
     assert again is not None
     add(store, again, of(store), 0.0)
-    for i in range(2 * begin):
-        store.add_references(OFFICE, [make_reference(f"most-{i}", 40 + i)])
+    store.add_references(OFFICE, [make_reference(f"most-{i}", 40 + i) for i in range(6)])
     assert claim_scene(store.database, KIND, is_first=True) is None  # idle time does it
+
+
+def test_after_an_upgrade_no_calibration_is_a_first_one(store: Store) -> None:
+    store.add_references(OFFICE, [make_reference("c", 3)])
+    add(store, claimed(store, OTHER), of(store, kind=OTHER), 0.0)
+    assert claim_scene(store.database, KIND, is_first=True) is None
+    assert claim_scene(store.database, KIND) is not None
 
 
 def test_frequent_changes_do_not_keep_servers_busy(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

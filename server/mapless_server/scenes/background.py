@@ -87,7 +87,7 @@ class SceneWork:
     """The work on scenes besides matches; None for work that is not done.
 
     Attributes:
-        calibrations: the first of a scene is made before references are matched, others after it; they use depths.
+        calibrations: the first of a scene is made between references, others after all of them; they use depths.
         depths: made before scenes are calibrated.
         features: further features of references.
         agreements: brought up to date after a scene's references are matched.
@@ -265,10 +265,9 @@ class BackgroundMatching:
                 log.warning("matching references in the background failed, and is tried again: %s", error)
 
     def _claim(self, works: Sequence[Work]) -> tuple[Work, Claim] | None:
-        """Claims the next reference; before it, scenes get their first calibration."""
+        """Claims the next reference; before it, a scene gets its first calibration: one, so that many delay nothing."""
         self.maintain()
-        while self._calibrate_next(is_first=True):
-            pass
+        self._calibrate_next(is_first=True)
         for work in works:
             claim = self._pairs.claim(work.name, self._progress[work.name])
             if claim is not None:

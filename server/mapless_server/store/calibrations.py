@@ -2,8 +2,9 @@
 
 There is one calibration for each *kind* of answers: features, backend and server version, see `calibration_kind`. It
 belongs to a generation of its scene; a later one makes the scene due again, and until then the last calibration is
-used. A first calibration, of a few references soon after they were added, leaves the scene due; it is made again when
-the scene's generation has doubled, until there is another one. A server claims a scene, localizes its references and
+used. A first calibration, of a few references soon after they were added, is for scenes without a calibration of any
+kind. It leaves the scene due, and is made again when the scene has twice as many references, until there is another
+one. A server claims a scene, localizes its references and
 stores the result; a claim ends by itself after `CLAIM_S` unless it is renewed, so a scene whose server is killed is
 calibrated by another server, or after a restart. A server that lost its claim, because it was too slow or the scene was
 deleted, stores nothing.
@@ -13,7 +14,7 @@ import random
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Select, and_, delete, func, or_, select, update
+from sqlalchemy import ColumnElement, Connection, Select, and_, delete, func, literal, or_, select, update
 
 from mapless_server.errors import NotFound
 from mapless_server.security import SceneKey
@@ -37,7 +38,7 @@ _CANDIDATES = 16
 
 @dataclass(frozen=True)
 class CalibrationClaim:
-    """A scene that one server calibrates for answers of a kind.
+    """A scene that one server calibrates for answers of a kind, with the number of its references when it was claimed.
 
     No other server's claim ends at the same microsecond.
     """
@@ -45,18 +46,21 @@ class CalibrationClaim:
     scene_key: SceneKey
     kind: str
     until_us: int
+    reference_count: int
 
 
 def claim_scene(database: Database, kind: str, is_first: bool = False) -> CalibrationClaim | None:
     """Claims a scene that has changed since its calibration; None if none may be claimed now.
 
-    With `is_first` only one that has at most a first calibration, and twice as many references since.
+    With `is_first` only one without a calibration of any kind, or with a first one of this kind and at least twice as
+    many references as when that was claimed.
     """
     select_due = _select_first(kind) if is_first else _select_due(kind)
     with database.read() as connection:
         due = connection.execute(select_due.limit(_CANDIDATES)).all()
     for row in random.sample(due, len(due)):
-        claim = CalibrationClaim(SceneKey(row.scene_id), kind, rows.now_us() + round(CLAIM_S * 1e6))
+        until_us = rows.now_us() + round(CLAIM_S * 1e6)
+        claim = CalibrationClaim(SceneKey(row.scene_id), kind, until_us, row.reference_count)
         with database.write() as connection:
             if _try_claim(connection, claim):
                 return claim
@@ -92,12 +96,13 @@ def add(
     """Stores the calibration of a claimed scene, and ends the claim; False if the claim was lost.
 
     It is not a change of the scene, but cached values of the scene are dropped. The scene may be calibrated again after
-    `wait_s`, however often it changes; a first calibration is stored as of its negative generation, and leaves it due.
+    `wait_s`, however often it changes. A first calibration leaves it due: instead of a generation, the number of
+    references when the scene was claimed is stored beside it, negative.
     """
     data = codec.encode_calibration(calibration)
     sha256 = codec.sha256_for(rows.calibration_owner(claim.scene_key, claim.kind), data)
     due_us = rows.now_us() + round(wait_s * 1e6)
-    generation = -calibration.generation if is_first else calibration.generation
+    generation = -claim.reference_count if is_first else calibration.generation
     values = {"generation": generation, "data": data, "sha256": sha256, "due_time_us": due_us}
     with store.changing() as connection:
         return connection.execute(_of(claim).values(**values, failure_count=0)).rowcount == 1
@@ -143,7 +148,7 @@ def _select_changed(kind: str) -> Select[Any]:
     of_kind = (column.scene_id == scene.c.scene_id) & (column.kind == kind)
     is_current: ColumnElement[bool] = column.generation == generation.generation
     return (
-        select(scene.c.scene_id)
+        select(scene.c.scene_id, scene.c.reference_count)
         .join(scene_generation, generation.scene_id == scene.c.scene_id)
         .outerjoin(scene_calibration, of_kind)
         .where(~is_detached(scene.c.scene_id), or_(column.generation.is_(None), ~is_current))
@@ -157,9 +162,12 @@ def _select_due(kind: str) -> Select[Any]:
 
 
 def _select_first(kind: str) -> Select[Any]:
-    column, now = scene_calibration.c, scene_generation.c.generation
-    grown = or_(column.generation.is_(None), and_(column.generation < 0, now >= -2 * column.generation))
-    return _select_due(kind).where(grown, scene.c.reference_count >= LEAST_REFERENCES)
+    column, of_any_kind, count = scene_calibration.c, scene_calibration.alias().c, scene.c.reference_count
+    is_calibrated = (
+        select(literal(1)).where(of_any_kind.scene_id == scene.c.scene_id, of_any_kind.generation.is_not(None)).exists()
+    )
+    has_doubled = and_(column.generation < 0, count >= -2 * column.generation)
+    return _select_due(kind).where(or_(~is_calibrated, has_doubled), count >= LEAST_REFERENCES)
 
 
 def _try_claim(connection: Connection, claim: CalibrationClaim) -> bool:

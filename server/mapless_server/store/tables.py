@@ -167,7 +167,8 @@ scene_calibration = Table(
     metadata,
     Column("scene_id", _SceneKey, ForeignKey("scene.scene_id", ondelete="CASCADE"), primary_key=True),
     Column("kind", _Matching, primary_key=True),
-    # Of the scene when its references were read; null until the first calibration is done.
+    # Of the scene when its references were read, after a first calibration the number of references, negative; null
+    # until one is done.
     Column("generation", BigInteger),
     # When a server may claim the scene: the end of a claim, or of the wait after a calibration or a failure.
     Column("due_time_us", BigInteger, nullable=False),

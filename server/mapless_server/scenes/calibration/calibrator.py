@@ -252,8 +252,8 @@ class SceneCalibrations:
     def calibrate_next(self, pause: Callable[[], None], is_first: bool = False) -> bool:
         """Calibrates one scene that may be claimed now; returns False if there is none. Raises if the store fails.
 
-        With `is_first` one without a calibration, or with a first one and twice as many references since, from a few of
-        its references. `pause` is called in the middle of the work; it may raise, which ends it.
+        With `is_first` one without a calibration of any kind, or with a first one and twice as many references since,
+        from a few of its references. `pause` is called in the middle of the work; it may raise, which ends it.
         """
         database = self._store.database
         claim = claim_scene(database, self.kind, is_first)
