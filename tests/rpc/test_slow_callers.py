@@ -30,10 +30,9 @@ from support.waiting import until
 
 from mapless.errors import from_rpc_error
 from mapless_server.errors import Overloaded, RequestError, Unauthenticated, Unavailable
-from mapless_server.rpc import receiving, sending
+from mapless_server.rpc import Call, receiving, sending
 from mapless_server.rpc.receiving import OpenMethods, Places, Receiver
 from mapless_server.rpc.sending import Pace, Unread
-from mapless_server.scheduling import Flow
 from mapless_server.security import Principal
 
 
@@ -144,7 +143,7 @@ class TestCallsWithHeadersOnly:
         monkeypatch.setattr(sending, "PER_S", 20)
         monkeypatch.setattr(sending, "BURST", 2)
 
-        def refuse(method: str, flow: Flow) -> None:
+        def refuse(method: str, call: Call) -> None:
             raise error
 
         start_s = time.monotonic()

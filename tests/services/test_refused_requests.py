@@ -3,8 +3,9 @@
 import asyncio
 import base64
 import math
+import time
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,8 +22,12 @@ from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.wire import FieldError
 from mapless_server.engine.options import EngineOptions
 from mapless_server.errors import RequestError
+from mapless_server.observability.metrics import Metrics
+from mapless_server.rpc import Call
+from mapless_server.services.handlers import Services
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.references import ReferenceService
+from mapless_server.settings import load_settings
 from mapless_server.store import SceneAttributes
 
 NAN, INFINITY = math.nan, math.inf
@@ -268,3 +273,21 @@ def test_a_wrong_field_is_refused_by_its_name(method: str, case: Case) -> None:
 
 def test_a_single_frame_is_no_sequence() -> None:
     assert refusal("LocalizeSequence", pb.LocalizeSequenceRequest(scene=SCENE, frames=[FRAME])).field == "frames"
+
+
+@pytest.mark.parametrize(
+    ("method", "is_refused"), [("LocalizationService/Localize", True), ("ReferenceService/GetScene", False)]
+)
+async def test_no_photograph_is_read_with_no_time_left(method: str, is_refused: bool) -> None:
+    """Other methods may take a millisecond."""
+    services = Services(load_settings({}, None).settings, cast(Any, None), Metrics())
+    services._engine = cast(Any, SimpleNamespace(check_room=lambda *_: None))
+    now_s = time.monotonic()
+    services._check_admission(f"/mapless.v1.{method}", Call("id", now_s, now_s + 1.0))
+    hurried = Call("id", now_s, now_s + 0.001)
+    if not is_refused:
+        services._check_admission(f"/mapless.v1.{method}", hurried)
+        return
+    with pytest.raises(RequestError) as caught:
+        services._check_admission(f"/mapless.v1.{method}", hurried)
+    assert (caught.value.code, caught.value.reason) == ("DEADLINE_EXCEEDED", "DEADLINE_INFEASIBLE")

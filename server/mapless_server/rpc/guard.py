@@ -23,7 +23,6 @@ from google.protobuf.message import DecodeError
 
 from mapless.wire import FieldError
 from mapless_server.errors import DeadlineExceeded, InvalidArgument, RequestError, Unavailable
-from mapless_server.scheduling import Flow
 from mapless_server.security import ENDLESS_METHODS, OPEN_METHODS, Principal
 
 from .call import Call
@@ -85,7 +84,7 @@ class CallGuard:
         max_deadline_s: float = 600.0,
         *,
         authenticate: Authenticate | None = None,
-        check_admission: Callable[[str, Flow], None] = lambda method, flow: None,
+        check_admission: Callable[[str, Call], None] = lambda method, call: None,
         observer: Metrics | None = None,
         tracer: OtlpTracer | None = None,
     ) -> None:
@@ -130,7 +129,7 @@ class CallGuard:
             with self._recorded(method, call, context) as result:
                 try:
                     call = replace(call, principal=self._principal(method, context))
-                    self._check_admission(method, call.flow)
+                    self._check_admission(method, call)
                     with self._places.taken(call.principal.holder):
                         response = await reply(handler, method, call, context)
                     context.set_trailing_metadata(call.trailers)

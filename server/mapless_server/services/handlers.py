@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +19,9 @@ from mapless.v1 import (
     reference_service_pb2,
     reference_service_pb2_grpc,
 )
-from mapless_server.errors import Unavailable
+from mapless_server.errors import DeadlineExceeded, Unavailable
 from mapless_server.observability.metrics import Metrics
-from mapless_server.rpc import Authenticate, CallGuard
-from mapless_server.scheduling import Flow
+from mapless_server.rpc import Authenticate, Call, CallGuard
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
@@ -49,6 +49,9 @@ _NEEDS_ROOM = {
     **{f"/{SERVICE_NAMES[1]}/{name}": False for name in ("CreateReference", "BatchCreateReferences")},
 }
 """The methods whose messages are large and whose work waits in the queue, and whether they are queries."""
+
+_LEAST_S = 0.002
+"""Such a method takes longer, however small its photographs: with less time left its message is not read."""
 
 _OF_STORE_ALONE = ("CreateScene", "ListScenes", "UpdateScene", "GetReference", "ListReferences")
 _OF_STORE = frozenset(f"/{SERVICE_NAMES[1]}/{name}" for name in _OF_STORE_ALONE)
@@ -185,15 +188,20 @@ class Services:
         if self._is_serving:
             await self.set_serving(True)
 
-    def _check_admission(self, method: str, flow: Flow) -> None:
-        """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for the caller."""
+    def _check_admission(self, method: str, call: Call) -> None:
+        """Raises Unavailable while the server starts or stops, and Overloaded while it has no room for the caller.
+
+        DeadlineExceeded if a photograph is to be computed in no time.
+        """
         if self._is_draining:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
         if self._engine is None and method in _OF_STORE:
             return
         engine = self._ready_engine()
         if (is_query := _NEEDS_ROOM.get(method)) is not None:
-            engine.check_room(flow, is_query)
+            if call.deadline_s - time.monotonic() < _LEAST_S:
+                raise DeadlineExceeded("no photograph is computed in so little time", reason="DEADLINE_INFEASIBLE")
+            engine.check_room(call.flow, is_query)
 
     def _ready_engine(self) -> QueueEngine:
         if self._engine is None:
