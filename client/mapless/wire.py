@@ -27,6 +27,9 @@ MIN_SIDE_PX, MAX_SIDE_PX = 32, 16384
 MAX_DISTORTION = 100.0
 MIN_FOCAL_PER_SIDE, MAX_FOCAL_PER_SIDE = 0.01, 100.0
 """A focal length, by the image's longer side: fields of view of 178 and 0.6 degrees."""
+MAX_READOUT_S, MAX_SPEED_M_PER_S, MAX_TURN_DEG_PER_S = 0.2, 1000.0, 3600.0
+"""Longest read-out of a rolling shutter, where the slowest sensors take 0.1 s, and largest speeds of its camera: an
+aircraft's, and ten turns a second."""
 
 
 class FieldError(ValueError):

@@ -17,6 +17,7 @@ from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless.groups import SequenceFrame, SequenceLocalization
 from mapless.priors import PosePrior, Priors
 from mapless.requests import ImageSource, IntrinsicsUncertainty, ReadoutDirection, read_mask
+from mapless.wire import MAX_READOUT_S, MAX_SPEED_M_PER_S, MAX_TURN_DEG_PER_S
 
 from .cameras import RosCamera
 from .depths import RosDepth
@@ -39,9 +40,6 @@ LEAST_SIGMA_M, LEAST_SIGMA_RAD = 0.02, 0.01
 
 ODOMETRY_DRIFT = 0.1
 """Standard deviation of odometry, as a share of the way and the angle: wheels slip."""
-
-MAX_READOUT_S, MAX_SPEED_M_PER_S, MAX_TURN_DEG_PER_S = 0.2, 1000.0, 3600.0
-"""Longest read-out and largest speeds that servers take."""
 
 SPEED_M_S, TURN_RAD_S, GUESS_LIFE_S = 1.5, 1.5, 5.0
 """Without odometry: how fast a robot may have moved since, and how long its last pose says anything."""

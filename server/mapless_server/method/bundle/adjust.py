@@ -55,7 +55,7 @@ WIDE_SIGMA = np.array([0.3, 0.3, 0.3, 1.0])
 LINEAR_CHANGE = np.array([0.01, 0.01, 0.01, 0.02])
 """Changes, in the units of `WIDE_SIGMA`, below which keypoints move in proportion to them, to a tenth of a pixel."""
 LEAST_MATCHES = 20
-"""Fewer do not determine a pose and intrinsics, nor decide between cameras."""
+"""Fewer do not determine a pose and intrinsics or a motion, nor decide between cameras."""
 GUESS_INFLATION = 1.5
 """Factor on standard deviations of intrinsics that are estimated with the pose. Evidence: unknown-camera."""
 ROUGHLY = 2.0

@@ -10,9 +10,6 @@ USUAL_TURN_DEG_PER_S = 90.0
 """Standard deviation of the angular speed of cameras that move, where none is stated: of a hand that looks around.
 Evidence: rolling-shutter."""
 
-MAX_READOUT_S = 0.2
-"""Longest read-out; the slowest sensors of cameras take 0.1 s."""
-
 
 class ReadoutDirection(Enum):
     """The side of the raster that is read first, and last; values are the axis (x, y) along which time runs."""
@@ -60,7 +57,7 @@ class RollingShutter:
     tracked: TrackedMotion | None = None
 
     def __post_init__(self) -> None:
-        check_bounds(self, "readout_s", above=0, at_most=MAX_READOUT_S)
+        check_bounds(self, "readout_s", above=0)
         check_bounds(self, "speed_m_per_s turn_deg_per_s", at_least=0)
 
     @property

@@ -44,6 +44,8 @@ from ..optim.optimize import (
     world_jacobian,
 )
 from ..structure.model import PixelPoints
+from ..structure.observations import MIN_NOISE_LEVEL_PX
+from .adjust import LEAST_MATCHES
 from .bundle import BundleProblem
 from .dispersion import disperse
 from .estimate import PosedSupport, PoseEstimate
@@ -58,17 +60,12 @@ Evidence: rolling-shutter."""
 SHARES: tuple[float, ...] = (0.6, 0.2, 0.2)
 """How many cameras move so. Evidence: rolling-shutter."""
 
-LOSS_SCALES_PX = (INEXACT_INLIER_PX, INEXACT_INLIER_PX / 3, AdjustOptions.loss_scale_sigma)
+LOSS_SCALES_PX = (INEXACT_INLIER_PX, INLIER_PX, AdjustOptions.loss_scale_sigma)
 """Scales of the Cauchy loss, one after the other: at the first pose matches are off by what the motion moves them."""
-STEPS = MinimizeOptions(iterations=8, min_decrease=1e-3)
+STEPS = MinimizeOptions(AdjustOptions.iterations, AdjustOptions.min_decrease)
 """Steps with each of these scales."""
-LEAST_MATCHES = 12
-"""Fewer do not determine a pose and a motion: 24 equations for 12 unknowns."""
 LEAST_DEPTH = 0.1
 """Least depth of a match, by the usual one: wrong ones beside the camera would be behind it after a small motion."""
-LEAST_SHIFT_PX = 0.25
-"""A motion that moves no keypoint by so much is left to the adjustment, to which it is linear."""
-
 
 TRACKED_SHARE = 0.9
 """How often the motion is as the device's tracking says, which may jump."""
@@ -173,7 +170,7 @@ def still_view(
     rays = query.camera.rays(pixels) * x_in_camera[fits, 2][nearest, None]
     turns = Rotation.from_rotvec(time[:, None] * motion[3:])
     at_rest = query.camera.project(turns.apply(rays - time[:, None] * motion[:3], inverse=True))
-    if not np.nanmax(np.linalg.norm(at_rest - pixels, axis=1)) >= LEAST_SHIFT_PX:
+    if not np.nanmax(np.linalg.norm(at_rest - pixels, axis=1)) >= MIN_NOISE_LEVEL_PX:  # the adjustment finds the rest
         return unmoved
     features = replace(query.features, keypoints=at_rest.astype(np.float32))
     return StillView(replace(query, features=features), time, motion, pose.inverse())

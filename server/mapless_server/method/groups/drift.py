@@ -15,11 +15,8 @@ import numpy as np
 
 from mapless.geometry import Array, RigidTransform, Similarity, cross_matrix
 
-from ..optim.optimize import perturbed, switched_cost, switched_weight
+from ..optim.optimize import median_chi_square, perturbed, switched_cost, switched_weight
 from ..optim.rotations import rotation_vector
-
-_MEDIAN_SQUARE = 5.35
-"""Median of a chi-square of six degrees of freedom."""
 
 SHARE, FLOOR_M = 0.012, 0.002
 """Noise of a step's position along each axis, as a share of the distance travelled, and what is added without motion.
@@ -111,7 +108,7 @@ class SequenceState:
         if not kept.any():
             return self
         found = float(np.median((self.residuals()[kept] ** 2).sum(axis=1)))
-        return replace(self, sigma=self.sigma * math.sqrt(max(1.0, found / _MEDIAN_SQUARE)))
+        return replace(self, sigma=self.sigma * math.sqrt(max(1.0, found / median_chi_square(6))))
 
     def cost(self) -> float:
         """See GroupState."""

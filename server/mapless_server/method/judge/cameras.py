@@ -119,7 +119,8 @@ def advice_for(lens: Distortion | None, wrong: Sequence[IntrinsicsCheck]) -> str
 
 
 MANY_MATCHES = 100
-"""Matches with points from which another camera needs to score less, see `MIN_GAIN`; chance gives fewer."""
+"""So many matches are not by chance: a reference shows what the photograph shows, and with points another camera needs
+to score less, see `MIN_GAIN`."""
 
 MIN_GAIN, LARGE_SHARE, MIN_GAIN_ELSE = 1.1, 0.45, 1.2
 """A pose is rejected if one of another camera scores this many times as high, where there are many matches with points

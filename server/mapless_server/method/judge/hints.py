@@ -13,7 +13,7 @@ from ..bundle.estimate import PosedSupport
 from ..features.views import PosedView, View
 from ..rejection import Advice, Hint, Rejection, RejectionReason
 from .answer import Answer
-from .cameras import compare_cameras
+from .cameras import MANY_MATCHES, compare_cameras
 
 _STAGES = {
     RejectionReason.NO_USABLE_REFERENCES: "coarse",
@@ -39,9 +39,6 @@ FEW_FEATURES = 200
 
 FEW_MATCHES = 30
 """References of another place have fewer matches with a photograph by chance."""
-
-MANY_MATCHES = 100
-"""A reference with so many matches shows what the photograph shows."""
 
 LEAST_USUAL_SHARE = 0.25
 """Share of a reference's matches that at least have points, and agree on a pose, unless something is wrong."""

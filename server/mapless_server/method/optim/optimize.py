@@ -37,6 +37,7 @@ Lie theory".
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -49,8 +50,17 @@ LEAST_DAMPING = 1e-9
 """Relative damping that moves no solution, and leaves what observations do not determine with no information."""
 
 
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+@cache
+def median_chi_square(degrees_of_freedom: int) -> float:
+    """The median of a chi-square variable."""
+    from scipy.special import gammaincinv  # here: services import this module, and answer before it is loaded
+
+    return 2 * float(gammaincinv(degrees_of_freedom / 2, 0.5))
+
+
+def normal_sigma(deviations: Array) -> Array:
+    """Standard deviations of normal deviations (N, ...) by their median size; few outliers hardly change them."""
+    return np.asarray(np.median(np.abs(deviations), axis=0) / median_chi_square(1) ** 0.5)
 
 
 def perturbed(target_from_source: RigidTransform, step: Array) -> RigidTransform:

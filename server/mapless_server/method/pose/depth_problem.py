@@ -13,14 +13,15 @@ from mapless.geometry import Array, RigidTransform, cross_matrix, normalize_jaco
 
 from ..bundle.pose_problem import DRIFT_INFLATION, OWN_INFLATION, USUAL_DRIFT, USUAL_OWN
 from ..optim.optimize import (
-    MAD_TO_SIGMA,
     cauchy_weight,
     motion_jacobian,
+    normal_sigma,
     perturbed,
     solve_step,
     world_covariance,
     world_jacobian,
 )
+from ..structure.kept_depth import AGREEING_SIGMA
 from ..structure.model import PixelPoints
 from .pnp import MIN_MATCHES, PnpOptions, false_alarms, ransac
 from .turned import BEHIND_PX, Rows, TurnedMatches
@@ -31,9 +32,6 @@ FIRST_SIGMA_PX, MIN_SIGMA_PX = 1.5, 0.5
 FIRST_DEPTH_SIGMA, MIN_DEPTH_SIGMA, MAX_DEPTH_SIGMA = 0.1, 0.01, 0.3
 """Initial, least and largest relative standard deviation of a depth; with a larger one nearly every match would be an
 inlier along its epipolar line. The first is also that of a network, which does not state its own."""
-
-INLIER_SIGMA = 3.0
-"""Largest residual of an inlier, in standard deviations."""
 
 ITERATIONS = 12
 """Steps of the estimation; errors of keypoints and depths are estimated anew in each."""
@@ -74,7 +72,7 @@ class DepthProblem:
 
     def inliers(self, distance: Array) -> NDArray[np.bool_]:
         """Mask (M,) of the inliers, by their distances in standard deviations."""
-        near = distance < INLIER_SIGMA
+        near = distance < AGREEING_SIGMA
         if self.turned is None:
             return near
         return np.asarray(near & (np.bincount(self.view, near)[self.view] >= MIN_INLIERS))
@@ -135,9 +133,9 @@ def solve(problem: DepthProblem, initial: RigidTransform | None) -> DepthSolutio
 
     def inlier_count(pose: RigidTransform) -> int:
         distance = _distances(linearize(problem, pose), FIRST_SIGMA_PX, FIRST_DEPTH_SIGMA)
-        return int((distance < INLIER_SIGMA).sum())
+        return int((distance < AGREEING_SIGMA).sum())
 
-    found, options = list[RigidTransform | None](), [PnpOptions(inlier_px=inlier_px) for inlier_px in (4.0, 16.0)]
+    found, options = list[RigidTransform | None](), [PnpOptions(), PnpOptions(inlier_px=16.0)]
     if len(problem.seen) >= MIN_MATCHES:
         found += [ransac(problem.seen, initial, it) for it in options]
     if problem.turned is not None and len(problem.turned) >= MIN_MATCHES:
@@ -182,13 +180,13 @@ def noise(rows: Rows, inliers: NDArray[np.bool_], stated_sigma: float | None) ->
     length = np.linalg.norm(by_depth, axis=1)
     direction = by_depth / np.maximum(length, 1e-9)[:, None]
     across = direction[:, 0] * residual[:, 1] - direction[:, 1] * residual[:, 0]
-    sigma_px = max(MIN_SIGMA_PX, MAD_TO_SIGMA * float(np.median(np.abs(across))))
+    sigma_px = max(MIN_SIGMA_PX, float(normal_sigma(across)))
     # Errors of depth show only where they move a projection by more than a keypoint errs.
-    shows = length * MAX_DEPTH_SIGMA > INLIER_SIGMA * sigma_px
+    shows = length * MAX_DEPTH_SIGMA > AGREEING_SIGMA * sigma_px
     if shows.sum() < MIN_INLIERS:
         return sigma_px, min(least if stated_sigma else FIRST_DEPTH_SIGMA, MAX_DEPTH_SIGMA)
     along = (direction * residual).sum(axis=1)[shows]
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(along / length[shows])))
+    spread = float(normal_sigma(along / length[shows]))
     from_pixels = float(np.median(sigma_px / length[shows]))
     depth_sigma = float(np.sqrt(max(0.0, spread**2 - from_pixels**2)))
     return sigma_px, float(np.clip(depth_sigma, least, MAX_DEPTH_SIGMA))
@@ -269,7 +267,7 @@ def score_of(problem: DepthProblem, solved: DepthSolution) -> float:
     # Areas of the residuals' ellipses of one standard deviation, square pixels.
     by_depth = solved.depth_sigma * linearize(problem, solved.world_from_camera, solved.log_factor).by_depth
     along_px = np.sqrt(solved.sigma_px**2 + np.square(by_depth).sum(axis=1))
-    areas = INLIER_SIGMA**2 * (np.pi * solved.sigma_px * along_px)
+    areas = AGREEING_SIGMA**2 * (np.pi * solved.sigma_px * along_px)
     image = problem.seen.camera.width_px * problem.seen.camera.height_px
     chance = float(np.mean(np.minimum(areas / image, 1.0)))
     return -false_alarms(len(solved.inliers), int(solved.inliers.sum()), chance)

@@ -33,12 +33,12 @@ from ..bundle.pose_problem import DRIFT_INFLATION, USUAL_DRIFT
 from ..bundle.priors import LIKELY_PROBABILITY, conflict_threshold, sharpened
 from ..features.tracks import Tracks
 from ..features.views import PosedView
-from ..optim.optimize import MAD_TO_SIGMA, cauchy_weight, moved, solve_columns, symmetric_products
+from ..optim.optimize import cauchy_weight, moved, normal_sigma, solve_columns, symmetric_products
 from ..structure.depth_mistakes import FITTING_SHARE
-from ..structure.kept_depth import REGIONS
+from ..structure.kept_depth import AGREEING_SIGMA, REGIONS
 from ..structure.model import Structure
 from ..structure.structure import observe
-from .depth_problem import INLIER_SIGMA, ITERATIONS, MIN_INLIERS
+from .depth_problem import ITERATIONS, MIN_INLIERS
 from .pnp import LN_10
 
 
@@ -92,7 +92,7 @@ class DepthComparison:
             return DepthCheck(self.keypoint_count, len(self), used=self.is_used, point_count=self.point_count)
         factor, weight = self.factor(covariance)
         mean = weight @ self.jacobian / weight.sum()
-        agrees = (self.log_ratio - factor) ** 2 < INLIER_SIGMA**2 * self.expected(covariance)
+        agrees = (self.log_ratio - factor) ** 2 < AGREEING_SIGMA**2 * self.expected(covariance)
         expected = self.prior_variance + 1 / weight.sum() + float(mean @ covariance @ mean)
         conflict = bool(2 * agrees.sum() < len(self) or factor**2 > conflict_threshold(1) * expected)
         sigma = math.sqrt(1 / weight.sum())
@@ -114,7 +114,7 @@ class DepthComparison:
         if check.conflict:
             return -math.log10(LIKELY_PROBABILITY)
         of_factor = 2 * math.sqrt(conflict_threshold(1) * self.prior_variance) / LN_10
-        of_depth = 2 * INLIER_SIGMA * float(np.median(np.sqrt(self.variance))) / max(self.spread, 1e-9)
+        of_depth = 2 * AGREEING_SIGMA * float(np.median(np.sqrt(self.variance))) / max(self.spread, 1e-9)
         agreeing = (2 * check.agreeing_count - len(self)) / REGIONS
         return min(0.0, math.log10(of_factor)) + max(0.0, agreeing) * min(0.0, math.log10(of_depth))
 
@@ -155,7 +155,7 @@ def compare_depths(support: PosedSupport) -> DepthComparison | None:
         np.log(depths.depth[keypoint].astype(np.float64)) - log_z,
         depths.relative_sigma[keypoint].astype(np.float64) ** 2 + of_points + shared,
         jacobian,
-        MAD_TO_SIGMA * float(np.median(np.abs(log_z - median))) if len(z) else 0.0,
+        float(normal_sigma(log_z - median)) if len(z) else 0.0,
         depths.common_sigma**2 + _held(support, point[usable], math.exp(median)),
         point_count,
     )
@@ -191,7 +191,7 @@ def improved(support: PosedSupport) -> PosedSupport:
 def contradicted(support: PosedSupport, excess: float) -> PosedSupport:
     """The support of a pose by depths, with a conflict if their errors exceed those stated as no right depth's do."""
     check, chance = support.estimate.depth_check, support.estimate.depth_log10_chance
-    if check is None or check.factor or excess <= INLIER_SIGMA:
+    if check is None or check.factor or excess <= AGREEING_SIGMA:
         return support
     chance -= math.log10(LIKELY_PROBABILITY)
     estimate = replace(support.estimate, depth_check=replace(check, conflict=True), depth_log10_chance=chance)

@@ -28,12 +28,13 @@ from mapless.geometry import Array
 
 from ..features.views import PosedView
 from ..optim.optimize import cauchy_weight
+from ..pairs.epipolar import MIN_MATCHES
 from ..significance import is_significant, sigmas_of_gains
 from .kept_depth import AGREEING_SIGMA
 from .measured_depth import MeasuredDepth
 from .seen_depths import SeenDepths
 
-MIN_PLACES = 24
+MIN_PLACES = MIN_MATCHES
 """Fewer places say nothing, as of matches, nor does a group with fewer than half of them."""
 OWN_SIGMAS = 1.645
 """By so much the triangulated points alone must prefer another reading: 5 % of right depths do so by chance."""

@@ -60,7 +60,8 @@ PLACED_REGIONS = 5
 """The same for points at the depths of a reference, whose errors of the pose they share. Evidence: depth-errors."""
 
 AGREEING_SIGMA = 3.0
-"""Largest difference of a depth from a triangulated point that it is of, in standard deviations."""
+"""Largest residual of a right match, and difference of a depth from a triangulated point that it is of, in standard
+deviations."""
 
 
 def with_kept_depths(

@@ -21,6 +21,7 @@ from ..optim.optimize import (
     apply_columns,
     columns,
     length,
+    median_chi_square,
     minimize_each,
     rows,
     soft_l1,
@@ -60,8 +61,6 @@ MIN_NOISE_LEVEL_PX = 0.15
 
 LEAST_OBSERVATIONS = 30
 """Fewer do not determine the level of the noise."""
-MEDIAN_NORMAL = 0.6745
-"""Median size of a normal number of standard deviation one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +219,7 @@ def estimate_noise(observations: Observations, x_in_world: Array, noise: Keypoin
     is_known = np.isfinite(length_px)
     used, by_count = (count >= 3) & is_known, np.sqrt(2 * np.log(2) * (1 - 1.5 / count))
     if used.sum() < LEAST_OBSERVATIONS:
-        used, by_count = (count == 2) & is_known, np.full(len(count), MEDIAN_NORMAL / np.sqrt(2))
+        used, by_count = (count == 2) & is_known, np.full(len(count), np.sqrt(median_chi_square(1) / 2))
     if used.sum() < LEAST_OBSERVATIONS:
         return noise
     observed_px = np.median(length_px[used] / by_count[used])

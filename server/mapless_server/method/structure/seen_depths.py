@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
+from ..features.limits import EPIPOLAR_PX
 from ..features.views import Matches, PosedView
-from ..optim.optimize import MAD_TO_SIGMA
+from ..optim.optimize import normal_sigma
 from ..pairs.epipolar import MIN_PARALLAX_DEG, PosedMatches, triangulate_depths
 from .measured_depth import MeasuredDepth
 
 KEYPOINT_PX = 1.0
 """Standard deviation of a keypoint, at least; more where matches of a pair are further from its epipolar lines."""
-MAX_EPIPOLAR_PX, MAX_RELATIVE_SIGMA = 2.0, 0.2
-"""Matches and triangulated points that are worse say nothing of a depth."""
+MAX_RELATIVE_SIGMA = 0.2
+"""Triangulated points that are worse say nothing of a depth."""
 POSE_SIGMA_M = 0.003
 """Standard deviation of the distance between two references, metres: a triangulated depth is off by as large a share.
 Chosen so that right depths of four recordings fit."""
@@ -85,10 +86,10 @@ def triangulated_depths(subject: PosedView, neighbour: PosedView, matches: Match
     rays = [ray @ it.world_from_camera.rotation.T for ray, it in zip(posed.rays[:, 0], views, strict=True)]
     depth, parallax_deg = triangulate_depths(centre, np.stack(rays, axis=1))
     distance_px = posed.distances_px()[0]
-    near = np.abs(distance_px) <= MAX_EPIPOLAR_PX
+    near = np.abs(distance_px) <= EPIPOLAR_PX
     if posed.are_at_one_place[0] or not near.any():
         return _nothing()
-    px = max(KEYPOINT_PX, MAD_TO_SIGMA * float(np.median(np.abs(distance_px[near]))))
+    px = max(KEYPOINT_PX, float(normal_sigma(distance_px[near])))
     px_to_share = np.sqrt(2) / posed.focal.min() / np.sin(np.radians(parallax_deg.clip(MIN_PARALLAX_DEG)))
     kept = near & (depth > 0).all(axis=1) & (parallax_deg >= MIN_PARALLAX_DEG)
     kept &= px * px_to_share <= MAX_RELATIVE_SIGMA

@@ -7,6 +7,7 @@ same in all, are those with which most matches agree (Sampson distance, Cauchy's
 estimated: an error of it is nearly a rotation, and many cameras' are off by as much as their mounting.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,12 +19,12 @@ from mapless_server.method.bundle.intrinsics import corrected_view, keypoint_mot
 from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.optim.optimize import (
-    MAD_TO_SIGMA,
     MinimizeOptions,
     cauchy_cost,
     cauchy_weight,
     damped_step,
     minimize,
+    normal_sigma,
 )
 from mapless_server.method.pose.two_view_matches import TwoViewMatches
 
@@ -109,7 +110,7 @@ def lens_contradiction(found: Sequence[SharedErrors]) -> SharedErrors | None:
         return None
     values, usual = np.array([it.value for it in found]), IntrinsicsSigma()
     middle = np.median(values, axis=0)
-    spread = 1.2533 * MAD_TO_SIGMA * np.median(np.abs(values - middle), axis=0) / np.sqrt(len(values))
+    spread = math.sqrt(math.pi / 2) * normal_sigma(values - middle) / math.sqrt(len(values))
     sigma = np.maximum(spread, np.median([it.sigma for it in found], axis=0))
     contradicted = np.abs(middle) > SIGMAS * np.maximum(sigma, (usual.focal_share, usual.k1))
     return SharedErrors(np.where(contradicted, middle, 0.0), sigma) if contradicted.any() else None

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.features.views import KeptDepth, PosedView, ReconstructedView, Reconstruction, map_cells
-from mapless_server.method.optim.optimize import MAD_TO_SIGMA
+from mapless_server.method.optim.optimize import normal_sigma
 from mapless_server.method.pairs.correspond import Correspondences
 from mapless_server.method.pairs.readings.repeats import pose_difference
 from mapless_server.method.structure.model import MetricScale, Structure
@@ -104,7 +104,7 @@ def _scaled(
     if len(ratio) < MIN_POINTS:
         return None
     middle = float(np.median(ratio))
-    sigma = max(MIN_SIGMA, MAD_TO_SIGMA * float(np.median(np.abs(ratio - middle))))
+    sigma = max(MIN_SIGMA, float(normal_sigma(ratio - middle)))
     if abs(middle) > np.log(MAX_SCALE) or sigma > MAX_SIGMA:
         return None
     return KeptDepth(view.camera, (depth * np.exp(middle)).astype(np.float32), sigma)

@@ -4,19 +4,16 @@ from dataclasses import replace
 from typing import Any
 
 from mapless.v1 import localization_service_pb2 as pb
-from mapless.wire import FieldError, joined
+from mapless.wire import MAX_READOUT_S, MAX_SPEED_M_PER_S, MAX_TURN_DEG_PER_S, FieldError, joined
 from mapless_server.engine.query import Photo
 from mapless_server.method.bundle.priors import IntrinsicsSigma
-from mapless_server.method.bundle.readout import MAX_READOUT_S, RollingShutter
+from mapless_server.method.bundle.readout import RollingShutter
 from mapless_server.method.options import LocalizeOptions
 
 from .enums import enum_from_message
 
 LEAST_SIGMA = 1e-6
 """Least standard deviation of intrinsics, as a share: they are exact, and their inverse squares are finite."""
-
-MAX_SPEED_M_PER_S, MAX_TURN_DEG_PER_S = 1000.0, 3600.0
-"""Largest speeds that may be stated: an aircraft's, and ten turns a second."""
 
 
 def uncertain_options(options: LocalizeOptions, message: Any, photo: Photo, path: str) -> LocalizeOptions:
