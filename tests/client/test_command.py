@@ -119,6 +119,17 @@ def test_a_reference_is_shown_and_its_photograph_downloaded(
     assert run("reference", "download", scene, "lost")[0] == 1
 
 
+def test_contradicting_labels_are_wrong_usage(run: Run, scene: str) -> None:
+    for arguments, message in (
+        (["create", "new", "--label", "site=a", "--label", "site=b"], "--label site is given as 'a' and as 'b'"),
+        (["update", scene, "--label", "site=a", "--forget", "labels"], "labels is given, and to be forgotten"),
+        (["create", "new", "--label", "site"], "'site' is not NAME=VALUE"),
+    ):
+        code, _, error = run("scene", *arguments)
+        assert code == 2
+        assert message in error
+
+
 def test_lists_are_tables_on_a_terminal(run: Run, client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     head, *rows = run("reference", "list", scene)[1].splitlines()

@@ -98,6 +98,19 @@ def test_wrong_labels_are_refused_by_field(client: Client, scene: str, labels: d
         assert caught.value.field == field
 
 
+@pytest.mark.parametrize(
+    ("labels", "message"),
+    [
+        (["site=a"], "labels must be a Mapping"),
+        ({"floor": 1}, r"labels\['floor'\] must be a str"),
+        ({1: "a"}, "a name"),
+    ],
+)
+def test_labels_of_another_type_are_named(client: Client, labels: Any, message: str) -> None:
+    with pytest.raises(TypeError, match=message):
+        client.create_scene("never", labels=labels)
+
+
 def test_an_update_needs_a_mask_and_an_existing_scene(client: Client, scene: str) -> None:
     with pytest.raises(InvalidArgument) as caught:
         client.update_scene(scene)

@@ -53,10 +53,20 @@ async def create_scene(
         datum=None if datum is None else datum_to_message(datum),
         down_in_world=None if down_in_world is None else wire.vector_to_message(down_in_world, "down_in_world"),
         arbitrary_unit=arbitrary_unit,
-        labels=labels or {},
+        labels=_labels(labels),
     )
     on_repeat = partial(repeats.created_scene, request)
     return await connection.call("CreateScene", request, _scene, timeout_s, on_repeat=on_repeat)
+
+
+def _labels(labels: Mapping[str, str] | None) -> Mapping[str, str]:
+    if labels is None:
+        return {}
+    wire.require(labels, Mapping, "labels", 'such as {"site": "a"}')
+    for name, value in labels.items():
+        wire.require(name, str, "a name in labels")
+        wire.require(value, str, f"labels[{name!r}]")
+    return labels
 
 
 def _scene(response: Any) -> Scene:
@@ -107,8 +117,8 @@ async def update_scene(
     if calibration is not None and calibration is not UNCHANGED:
         request.scene.calibration.CopyFrom(calibration_to_message(calibration))
     request.scene.arbitrary_unit = arbitrary_unit is True
-    if labels is not None and labels is not UNCHANGED:
-        request.scene.labels.update(labels)
+    if labels is not UNCHANGED:
+        request.scene.labels.update(_labels(labels))
     return await connection.call("UpdateScene", request, _scene, timeout_s)
 
 
@@ -120,7 +130,7 @@ async def list_scenes(
     timeout_s: float | None = None,
 ) -> AsyncIterator[Scene]:
     """Lists the scenes with all of these labels by id, fetched page by page; the deadline holds for each page."""
-    request = pb.ListScenesRequest(page_size=page_size, labels=labels or {})
+    request = pb.ListScenesRequest(page_size=page_size, labels=_labels(labels))
     scenes = connection.listed("ListScenes", request, lambda page: map(scene_from_message, page.scenes), timeout_s)
     async for scene in scenes:
         yield scene

@@ -41,7 +41,7 @@ def create_scene(client: Client, arguments: argparse.Namespace) -> int:
         datum=datum,
         down_in_world=down,
         arbitrary_unit=is_arbitrary,
-        labels=dict(arguments.label),
+        labels=_given_labels(arguments),
     )
     return show(arguments, scene, _scene_card(scene))
 
@@ -56,7 +56,9 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
     if arguments.unit is not None:
         changes["arbitrary_unit"] = arguments.unit == "arbitrary"
     if arguments.label:
-        changes["labels"] = dict(arguments.label)
+        changes["labels"] = _given_labels(arguments)
+    if both := [it for it in arguments.forget if changes[it] is not None]:
+        raise ValueError(f"{both[0]} is given, and to be forgotten")
     if not changes:
         raise ValueError("nothing to change: give --datum, --down, --unit, --label or --forget")
     scene = client.update_scene(arguments.scene, **changes)
@@ -106,13 +108,21 @@ def _unit(scene: Scene) -> str:
     return "arbitrary" if scene.arbitrary_unit else "m"
 
 
+def _given_labels(arguments: argparse.Namespace) -> dict[str, str]:
+    labels = dict[str, str]()
+    for name, value in arguments.label:
+        if labels.setdefault(name, value) != value:
+            raise ValueError(f"--label {name} is given as {labels[name]!r} and as {value!r}")
+    return labels
+
+
 def _labels(scene: Scene) -> str:
     return ", ".join(f"{name}={value}" for name, value in sorted(scene.labels.items()))
 
 
 def list_scenes(client: Client, arguments: argparse.Namespace) -> int:
     """Lists all scenes, or those with labels."""
-    scenes = list(client.list_scenes(labels=dict(arguments.label)))
+    scenes = list(client.list_scenes(labels=_given_labels(arguments)))
     rows = [(it.scene_id, it.reference_count, _unit(it), _place(it.datum), _minute(it), _labels(it)) for it in scenes]
     head = "SCENE", "REFERENCES", "UNIT", "LATITUDE, LONGITUDE", "CREATED", "LABELS"
     return show(arguments, scenes, table(head, rows))

@@ -16,6 +16,10 @@ LEAST_SIGMA = 1e-6
 """Least standard deviation of intrinsics, as a share: they are exact, and their inverse squares are finite."""
 
 
+LEAST_MOTION = 1e-6
+"""Least read-out time and speeds other than 0: smaller ones move nothing, and their inverse squares are not finite."""
+
+
 def uncertain_options(options: LocalizeOptions, message: Any, photo: Photo, path: str) -> LocalizeOptions:
     """The options with what a photograph's message says of its intrinsics and its shutter in `intrinsics_uncertainty`.
 
@@ -56,16 +60,19 @@ def _sigma_from(message: pb.IntrinsicsUncertainty, photo: Photo, field: str) -> 
 def _shutter_from(message: pb.IntrinsicsUncertainty, field: str) -> RollingShutter | None:
     """Reads the read-out of a rolling shutter; None without one. FieldError names a wrong field."""
 
-    def number(name: str, most: float) -> float:
+    def number(name: str, most: float, unit: str) -> float:
         value: float = getattr(message, name)
-        if not 0 <= value <= most:
-            raise FieldError(f"{field}.{name}", f"must be 0 to {most:g}, is {value:g}")
+        if not (value == 0 or LEAST_MOTION <= value <= most):
+            raise FieldError(f"{field}.{name}", f"must be 0, or {LEAST_MOTION:g} to {most:g} {unit}, is {value:g}")
         if value and not message.readout_s:
             raise FieldError(f"{field}.{name}", "is of a rolling shutter, and readout_s is 0")
         return value
 
-    readout_s = number("readout_s", MAX_READOUT_S)
-    speeds = number("speed_m_per_s", MAX_SPEED_M_PER_S), number("turn_deg_per_s", MAX_TURN_DEG_PER_S)
+    readout_s = number("readout_s", MAX_READOUT_S, "seconds")
+    speeds = (
+        number("speed_m_per_s", MAX_SPEED_M_PER_S, "metres a second"),
+        number("turn_deg_per_s", MAX_TURN_DEG_PER_S, "degrees a second"),
+    )
     default, named = RollingShutter.direction, f"{field}.readout_direction"
     direction = enum_from_message(message.readout_direction, pb.ReadoutDirection, default, named)
     return RollingShutter(readout_s, direction, *speeds) if readout_s else None
