@@ -139,7 +139,8 @@ def _solved(
     posed = replace(posed, estimate=estimate)
     if still is not None and prepared.options.shutter is not None:
         with stage("shutter"):
-            posed = replace(posed, estimate=with_motion(posed, still, prepared.options.shutter, options.adjust))
+            shutter = prepared.options.shutter
+            posed = replace(posed, estimate=with_motion(posed, still, shutter, options.adjust, priors))
     return _judged(posed if query.depths is None else improved(posed), coarse, chance, agreement)
 
 

@@ -14,7 +14,7 @@ from mapless.geometry import Array, Camera
 from mapless.lenses import RadialTangential
 from mapless_server.method.bundle.estimate import PosedSupport, accuracy_from_covariance
 from mapless_server.method.bundle.pose_problem import AdjustOptions
-from mapless_server.method.bundle.priors import NO_PRIORS
+from mapless_server.method.bundle.priors import NO_PRIORS, PositionPrior, Priors
 from mapless_server.method.bundle.readout import ReadoutDirection, RollingShutter, TrackedMotion
 from mapless_server.method.bundle.shutter import (
     MotionPrior,
@@ -59,10 +59,15 @@ def read_by_rows(
     return replace(scene, query=replace(query, features=features))
 
 
-def off(scene: SyntheticScene, shutter: RollingShutter | None, variant: Variant = Variant.BEST) -> tuple[float, float]:
+def off(
+    scene: SyntheticScene,
+    shutter: RollingShutter | None,
+    variant: Variant = Variant.BEST,
+    priors: Priors = NO_PRIORS,
+) -> tuple[float, float]:
     """The error of the position, metres, and its radius of 95 %."""
     options = LocalizeOptions(variant, shutter=shutter)
-    found = pose_of(localize(scene.query, scene.references, pipeline_of("geometric", scene), options))
+    found = pose_of(localize(scene.query, scene.references, pipeline_of("geometric", scene), options, priors=priors))
     assert found.covariance is not None
     metres, _ = pose_error(found.world_from_camera, scene.world_from_query)
     return metres, accuracy_from_covariance(found.covariance).position_95_m
@@ -79,6 +84,18 @@ def test_a_planted_motion_is_removed_from_the_pose(motion: tuple[float, ...]) ->
     assert moving_m > 2 * still_m
     assert found_m < max(0.4 * moving_m, 2 * still_m)
     assert found_m < found_95_m < 3 * still_95_m
+
+
+@pytest.mark.parametrize("variant", [Variant.BEST, Variant.FULL])
+@pytest.mark.parametrize("motion", ["pan", "walk and pan"])
+def test_a_motion_moves_and_widens_no_position_that_is_known(motion: str, variant: Variant) -> None:
+    sigma_m, moving = 1e-4, read_by_rows(SCENE, np.array(MOTIONS[motion]))
+    priors = Priors(position=PositionPrior(SCENE.world_from_query.translation, sigma_m**2 * np.eye(3)))
+    (still_m, still_95_m), (found_m, found_95_m) = (
+        off(scene, shutter, variant, priors) for scene, shutter in ((SCENE, None), (moving, SHUTTER))
+    )
+    assert max(still_m, found_m) < sigma_m
+    assert found_95_m < 1.05 * still_95_m
 
 
 @pytest.mark.parametrize("variant", [Variant.BEST, Variant.FULL])

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array
+from mapless.geometry import Array, RigidTransform
 
 from ..features.tracks import Tracks
 from ..features.views import PosedView
@@ -98,12 +98,16 @@ class BundleProblem:
             equations.pose_block[intrinsics, intrinsics] += np.diag(self.intrinsics_information)
             equations.pose_gradient[intrinsics] += self.intrinsics_information * errors
         if self.priors:
-            pose = bundle.world_from_query
-            gradient, information = self.priors.gradient_and_information(pose)
-            to_world = world_jacobian(pose)
-            equations.pose_gradient[query] += self.prior_weight * to_world.T @ gradient
-            equations.pose_block[query, query] += self.prior_weight * to_world.T @ information @ to_world
+            gradient, information = self.of_priors(bundle.world_from_query)
+            equations.pose_gradient[query] += gradient
+            equations.pose_block[query, query] += information
         return equations
+
+    def of_priors(self, world_from_query: RigidTransform) -> tuple[Array, Array]:
+        """Gradient (6,) and information (6, 6) of half the priors' cost by a left perturbation of camera_from_world."""
+        gradient, information = self.priors.gradient_and_information(world_from_query)
+        to_world = world_jacobian(world_from_query)
+        return self.prior_weight * to_world.T @ gradient, self.prior_weight * to_world.T @ information @ to_world
 
     def step(self, there: Linearized, equations: NormalEquations, damping: float) -> Linearized | None:
         """See `optimize.Problem`."""

@@ -153,11 +153,12 @@ class Dispersion:
         return np.asarray((count - 1) / count * references.T @ references + regions.T @ regions)
 
 
-def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Dispersion | None:
+def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int, with_priors: bool = False) -> Dispersion | None:
     """Computes how the query's pose changes without parts of the data; None if all data do not determine it.
 
-    The bundle is the optimum of the adjustment's problem, or near it; the problem's priors on the pose are not used. At
-    most `max_matches` of the query's matches are, evenly thinned: shared errors are the same in all of them.
+    The bundle is the optimum of the adjustment's problem, or near it; the problem's priors on the pose are used only
+    `with_priors`. At most `max_matches` of the query's matches are used, evenly thinned: shared errors are the same in
+    all of them.
     """
     seen, bundle, thinning = _thinned(problem.by_view, bundle, max_matches)
     there = seen.at(bundle)
@@ -170,6 +171,9 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int) -> Disper
     held = slice(query.start)
     prior[held, held] = problem.information / thinning
     prior_gradient[held] = prior[held, held] @ problem.reference_motion(bundle).ravel()
+    if with_priors:
+        gradient_of_priors, information = problem.of_priors(bundle.world_from_query)
+        prior[query, query], prior_gradient[query] = information / thinning, gradient_of_priors / thinning
     to_pose = _rows_of_pose((data + prior)[posed, posed])
     if to_pose is None:
         return None

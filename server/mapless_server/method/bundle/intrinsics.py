@@ -67,7 +67,9 @@ class ContradictionOptions:
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicsEquations:
-    """Normal equations of the I errors of the intrinsics, all other unknowns eliminated; see `dispersion`.
+    """Normal equations of I errors, all other unknowns eliminated; see `dispersion`.
+
+    They are the four of the intrinsics, or the six components of a motion during the read-out (see `shutter`).
 
     Attributes:
         matrices, gradients: (1 + K, I, I) and (1 + K, I): of all data, and without each of K references.
@@ -84,14 +86,14 @@ class IntrinsicsEquations:
     def estimate(
         self, removed: Array, information: Array, inflation: float, region_factor: float
     ) -> tuple[Array, Array]:
-        """The errors (..., 4), and their covariance (..., 4, 4), which contains what matches share.
+        """The errors (..., I), and their covariance (..., I, I), which contains what matches share.
 
         As that of a pose, it is the sum of the jackknife over references and over regions; to which come what the prior
         leaves and what the residuals say, for few references may agree by chance.
 
         Args:
-            removed: (4,) errors that are removed from the intrinsics at which the equations are linearized.
-            information: (..., 4) inverse variances of the errors without the photograph.
+            removed: (I,) errors that are removed where the equations are linearized.
+            information: (..., I) inverse variances of the errors without the photograph.
             inflation: factor of standard deviations that follow from residuals; weighs the data against the prior.
             region_factor: see `UncertaintyOptions`.
 

@@ -52,6 +52,7 @@ from .estimate import PosedSupport, PoseEstimate
 from .intrinsics import IntrinsicsEquations
 from .normal_equations import Bundle
 from .pose_problem import AdjustInput, AdjustOptions, pose_problem
+from .priors import NO_PRIORS, Priors
 from .readout import RollingShutter
 
 SCALES: tuple[float, ...] = (0.001, 0.25, 1.0)
@@ -185,16 +186,21 @@ def row_times(view: View, shutter: RollingShutter) -> Array:
 
 
 def with_motion(
-    support: PosedSupport, still: StillView, shutter: RollingShutter, options: AdjustOptions
+    support: PosedSupport,
+    still: StillView,
+    shutter: RollingShutter,
+    options: AdjustOptions,
+    priors: Priors = NO_PRIORS,
 ) -> PoseEstimate:
     """The estimate of a support with what is left of the motion: the pose follows it, the covariance contains it.
 
-    The support's view is that of `still`, or the same read with other intrinsics.
+    The support's view is that of `still`, or the same read with other intrinsics. Those of the priors that the estimate
+    uses hold the pose while it follows, and so say something of the motion, too.
     """
-    estimate = support.estimate
-    equations = _equations(support, still.time, options)
+    estimate, used = support.estimate, priors.consistent(support.estimate.prior_checks)
+    equations = _equations(support, still.time, options, used)
     if equations is None:
-        return without_motion(support, still.time, shutter)
+        return without_motion(support, still.time, shutter, used)
     prior = MotionPrior.of(shutter, support.distance_m())
     inflation, region_factor, removed = options.error_inflation, options.uncertainty.region_factor, still.motion
     given = equations.matrices[0] / inflation**2, equations.gradients[0] / inflation**2
@@ -215,8 +221,13 @@ def with_motion(
     return _with_covariance(replace(estimate, world_from_camera=pose), change)
 
 
-def without_motion(support: PosedSupport, time: Array, shutter: RollingShutter) -> PoseEstimate:
-    """The estimate of a support whose matches do not show the motion: the covariance contains all of its prior."""
+def without_motion(
+    support: PosedSupport, time: Array, shutter: RollingShutter, used: Priors = NO_PRIORS
+) -> PoseEstimate:
+    """The estimate of a support whose matches do not show the motion: the covariance contains all of its prior.
+
+    It contains no more than the priors on the pose that were used leave.
+    """
     estimate, two_view = support.estimate, support.two_view
     x_in_world = support.structure.x_in_world[support.matches.point[estimate.inliers]]
     keypoint = support.matches.keypoint[estimate.inliers]
@@ -228,7 +239,7 @@ def without_motion(support: PosedSupport, time: Array, shutter: RollingShutter) 
     cross = np.einsum("aim,ajm->ij", by_pose, by_pose * time[keypoint])
     by_motion = world_jacobian(estimate.world_from_camera) @ -np.linalg.pinv(information, hermitian=True) @ cross
     spread = MotionPrior.of(shutter, support.distance_m()).spread
-    return _with_covariance(estimate, by_motion @ spread @ by_motion.T)
+    return _with_covariance(estimate, used.sharpened(by_motion @ spread @ by_motion.T, estimate.world_from_camera))
 
 
 def _with_covariance(estimate: PoseEstimate, by_motion: Array) -> PoseEstimate:
@@ -281,7 +292,10 @@ class _Moving:
         return information, gradient
 
     def of_matches(self, x: tuple[RigidTransform, Array]) -> tuple[Array, Array]:
-        """The same without the prior."""
+        """The same without the prior, derivatives to first order in m.
+
+        A perturbation of the pose in the middle is taken for one at the time of the row, without Ad(Exp(t m)).
+        """
         x_in_camera = self._in_camera(x)
         residual = self._residual(x_in_camera)
         weight = cauchy_weight((residual**2).sum(axis=1), self.loss_scale_px)
@@ -306,19 +320,27 @@ class _Moving:
 
 
 def _at_times(x_in_camera: Array, time: Array, motion: Array) -> Array:
-    """Points (M, 3) in the frame of the camera at the time (M,) of each, from those in the middle: Exp(t m) x."""
+    """Points (M, 3) in the frame of the camera at the time (M,) of each, from those in the middle: Exp(t m) x.
+
+    To first order in m: the shift is t v, as if the camera did not turn meanwhile.
+    """
     turned = Rotation.from_rotvec(time[:, None] * motion[3:]).apply(x_in_camera)
     return np.asarray(turned + time[:, None] * motion[:3])
 
 
-def _equations(support: PosedSupport, time: Array, options: AdjustOptions) -> IntrinsicsEquations | None:
-    """Normal equations of the motion, all other unknowns eliminated; None if the matches do not determine a pose."""
+def _equations(support: PosedSupport, time: Array, options: AdjustOptions, used: Priors) -> IntrinsicsEquations | None:
+    """Normal equations of the motion, all other unknowns eliminated; None if the matches do not determine a pose.
+
+    They contain the priors on the pose that were used, as the adjustment weighs them.
+    """
     estimate = support.estimate
-    used = np.flatnonzero(estimate.errors_px < options.max_error_px)
-    if len(used) < LEAST_MATCHES:
+    chosen = np.flatnonzero(estimate.errors_px < options.max_error_px)
+    if len(chosen) < LEAST_MATCHES:
         return None
-    problem, there = pose_problem(AdjustInput.of(support, options), used, estimate.world_from_camera)
-    dispersion = disperse(*_with_motion(problem, there.bundle, time), options.uncertainty.max_matches)
+    problem, there = pose_problem(AdjustInput.of(support, options), chosen, estimate.world_from_camera)
+    problem = replace(problem, priors=used, prior_weight=options.error_inflation**2)
+    wider, bundle = _with_motion(problem, there.bundle, time)
+    dispersion = disperse(wider, bundle, options.uncertainty.max_matches, bool(used))
     return None if dispersion is None else dispersion.intrinsics
 
 
