@@ -94,3 +94,15 @@ class DataLoss(RequestError):
     """Stored bytes are damaged."""
 
     code = "DATA_LOSS"
+
+
+class NetworkNotLoaded(RuntimeError):
+    """A network cannot be loaded; no error of a request, but a fault of the server that lasts.
+
+    Attributes:
+        retry_after_s: seconds until loading is tried again; before, it fails at once.
+    """
+
+    def __init__(self, message: str, retry_after_s: float) -> None:
+        super().__init__(message)
+        self.retry_after_s = retry_after_s

@@ -11,7 +11,10 @@ import pytest
 from support.scenes import CAMERA, make_scene, random_for
 
 from mapless.geometry import Camera
+from mapless_server.engine.failures import failure_of
+from mapless_server.errors import NetworkNotLoaded
 from mapless_server.method.features.views import Features, Matches, View
+from mapless_server.scheduling import Failure
 from mapless_server.serve import deferred
 from mapless_server.serve.deferred import DeferredExtractor, DeferredPairMatching
 
@@ -70,6 +73,45 @@ def test_a_failure_is_remembered_for_a_time_then_tried_again(monkeypatch: pytest
             matching.match_one(scene.query, VIEW)
     monkeypatch.setattr(deferred, "FAILED_S", 0.0)
     assert matching.match_one(scene.query, VIEW).tolist() == [[len(scene.query.features), 0]]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("CUDA out of memory. Tried to allocate 20.00 MiB")])
+def test_too_little_memory_is_said_and_not_remembered(error: Exception) -> None:
+    failures = [error]
+
+    def make() -> Finds:
+        if failures:
+            raise failures.pop()
+        return Finds()
+
+    extractor = DeferredExtractor("finds-1", make)
+    with pytest.raises(MemoryError, match="finds-1 cannot be loaded") as failed:
+        extractor.made()
+    assert failure_of(failed.value) is Failure.OUT_OF_MEMORY
+    assert extractor.made().name == "finds-1"
+
+
+@pytest.mark.parametrize("end", [SystemExit, KeyboardInterrupt])
+def test_the_end_of_a_thread_stays_one(end: type[BaseException]) -> None:
+    ends = [end()]
+
+    def make() -> Finds:
+        if ends:
+            raise ends.pop()
+        return Finds()
+
+    extractor = DeferredExtractor("finds-1", make)
+    with pytest.raises(end):
+        extractor.made()
+    assert extractor.made().name == "finds-1"
+
+
+def test_a_failure_says_how_long_it_lasts() -> None:
+    extractor = DeferredExtractor("finds-2", Finds)
+    for _ in range(2):
+        with pytest.raises(NetworkNotLoaded) as failed:
+            extractor.made()
+        assert deferred.FAILED_S - 60 < failed.value.retry_after_s <= deferred.FAILED_S
 
 
 def test_threads_that_wait_for_a_failure_get_it_together() -> None:

@@ -1,7 +1,7 @@
 """Networks that are made when they are needed first, in the thread that needs them: torch takes seconds to load.
 
-They are named before, by the digest of their weights. RuntimeError where they cannot be loaded, or the weights are not
-those that are named.
+They are named before, by the digest of their weights. NetworkNotLoaded where they cannot be loaded, or the weights are
+not those that are named.
 """
 
 import logging
@@ -16,9 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera
+from mapless_server.engine.failures import failure_of
+from mapless_server.errors import NetworkNotLoaded
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.matching import PairMatching
 from mapless_server.method.features.views import Ignored, Matches, View
+from mapless_server.scheduling import Failure
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +45,8 @@ FAILED_S = 300.0
 class Deferred(Generic[T]):
     """Made once, by the first thread that asks; those that ask meanwhile wait for it.
 
-    An error is raised to all of them, and to each that asks within `FAILED_S`.
+    An error is raised to all of them, and to each that asks within `FAILED_S`. Memory that does not suffice is not
+    remembered: others may free it at any time.
     """
 
     def __init__(self, name: str, make: Callable[[], T]) -> None:
@@ -53,10 +57,14 @@ class Deferred(Generic[T]):
         self._lock = Lock()
 
     def made(self) -> T:
-        """The value; RuntimeError with the reason if it cannot be made, or has another name."""
+        """The value.
+
+        NetworkNotLoaded with the reason if it cannot be made, or has another name; MemoryError if memory, also that of
+        the device, does not suffice.
+        """
         with self._lock:
             making = self._making
-            if making is None or (making.done() and making.exception() and self._has_rested()):
+            if making is None or (making.done() and making.exception() and not self._rest_s()):
                 mine = self._making = Future[T]()
             else:
                 mine = None
@@ -65,14 +73,19 @@ class Deferred(Generic[T]):
             return self._value(making)
         try:
             mine.set_result(self._made())
-        except BaseException as error:  # else those that wait would wait for ever
-            self._failed_s = time.monotonic()
-            log.warning("%s cannot be loaded, and is tried again after %.0f s: %s", self.name, FAILED_S, error)
+        except Exception as error:
+            if failure_of(error) is not Failure.OUT_OF_MEMORY:
+                self._failed_s = time.monotonic()
+                log.warning("%s cannot be loaded, and is tried again after %.0f s: %s", self.name, FAILED_S, error)
             mine.set_exception(error)
+        except BaseException as error:  # the thread ends; those that wait would wait for ever
+            mine.set_exception(error)
+            raise
         return self._value(mine)
 
-    def _has_rested(self) -> bool:
-        return time.monotonic() >= self._failed_s + FAILED_S
+    def _rest_s(self) -> float:
+        """Seconds until it is tried again after a failure."""
+        return max(0.0, self._failed_s + FAILED_S - time.monotonic())
 
     def _made(self) -> T:
         made = self._make()
@@ -82,9 +95,12 @@ class Deferred(Generic[T]):
 
     def _value(self, making: Future[T]) -> T:
         # A new error for each thread: a traceback that they share would grow, and keep what they compute with.
-        if (error := making.exception()) is not None:
-            raise RuntimeError(f"{self.name} cannot be loaded: {error}") from error
-        return making.result()
+        if (error := making.exception()) is None:
+            return making.result()
+        message = f"{self.name} cannot be loaded: {error or type(error).__name__}"
+        if failure_of(error) is Failure.OUT_OF_MEMORY:
+            raise MemoryError(message) from error
+        raise NetworkNotLoaded(message, self._rest_s()) from error
 
 
 class DeferredExtractor(Deferred[FeatureExtractor]):
