@@ -17,6 +17,8 @@ from research.evidence.page import PAGES, Measurement, Row, rewritten
 CODE = PAGES.parents[1] / "server"
 STATED = re.compile(r"^`([\w.]+):([\w.]+)` = `([^`]+)`$", re.MULTILINE)
 NAMED = re.compile(r"Evidence: ([a-z][\w-]*(?:, [a-z][\w-]*)*)\.")
+DIGEST = r"(?!0{8})[0-9a-f]{8}"
+HAS_ROW = re.compile(r"^\|(?: ?-+ ?\|)+\n\|.*\d", re.MULTILINE)
 INDEX = PAGES / "index.md"
 EVIDENCE = sorted({*PAGES.glob("*.md")} - {INDEX})
 
@@ -53,17 +55,28 @@ def test_a_page_states_the_values_that_the_code_has(path: Path) -> None:
     assert [text.count(it) for it in parts] == [1, 1, 1, 1]
 
 
+def is_measured(key: str, text: str) -> bool:
+    """Whether a page has its program's command, of a commit, and a row after it; else it names another one."""
+    (command,) = re.findall(r"^\*\*Command\.\*\* (.*(?:\n.+)*)", text, re.MULTILINE)
+    options = r"(?: DATA=\S+)?(?: ARGS='--sample \d+')?"
+    if re.match(rf"`make evidence KEY={key}{options}`, \d{{4}}-\d\d-\d\d, {DIGEST}", command):
+        assert HAS_ROW.search(text, text.index(command)), f"{key}: its table has no rows"
+        return True
+    assert re.match(rf"none: measured at {DIGEST}|`[^`]*python -m bench[\w.]* ", command), key
+    return False
+
+
 def test_every_page_is_measured_by_a_program_or_says_it_is_not() -> None:
-    measured = set()
-    for path in EVIDENCE:
-        (command,) = re.findall(r"^\*\*Command\.\*\* (.*(?:\n.+)*)", path.read_text(), re.MULTILINE)
-        options = r"(?: DATA=\S+)?(?: ARGS='--sample \d+')?"
-        if re.match(rf"`make evidence KEY={path.stem}{options}`, \d{{4}}-\d\d-\d\d, [0-9a-f]{{8}}", command):
-            measured.add(path.stem)
-        else:
-            assert re.match(r"none: measured at [0-9a-f]{8}|`[^`]*python -m bench[\w.]* ", command), path.name
-    assert measured == set(KEYS)
+    assert {path.stem for path in EVIDENCE if is_measured(path.stem, path.read_text())} == set(KEYS)
     assert all(measurement_of(key).rows for key in KEYS)
+
+
+@pytest.mark.parametrize(("digest", "row"), [("0" * 8, "| 1 |\n"), ("be589da6", "")])
+def test_a_page_without_a_commit_or_rows_is_not_measured(digest: str, row: str) -> None:
+    text = f"**Command.** `make evidence KEY=k`, 2026-11-29, {{}}.\n\n| a |\n| --- |\n{row}\n**Decision.** 1.\n"
+    assert is_measured("k", text.format("be589da6").replace("\n\n**", "\n| 2 |\n\n**"))
+    with pytest.raises(AssertionError, match=r"^k"):
+        is_measured("k", text.format(digest))
 
 
 @cache
