@@ -66,10 +66,18 @@ LOSS_SCALES_PX = (INEXACT_INLIER_PX, INLIER_PX, AdjustOptions.loss_scale_sigma)
 STEPS = MinimizeOptions(AdjustOptions.iterations, AdjustOptions.min_decrease)
 """Steps with each of these scales."""
 LEAST_DEPTH = 0.1
-"""Least depth of a match, by the usual one: wrong ones beside the camera would be behind it after a small motion."""
+"""Least depth of a match, by the usual one: wrong ones beside the camera would be behind it after a small motion.
+
+In a room, 3 m, it is 0.3 m: six times what a vehicle of 3 m/s moves in half of a read-out of 33 ms. Right matches are
+hardly ever nearer: references would see them from elsewhere.
+"""
 
 TRACKED_SHARE = 0.9
-"""How often the motion is as the device's tracking says, which may jump."""
+"""How often the motion is as the device's tracking says, which may jump.
+
+Not measured: what is left to the other parts has to be enough for the matches to outvote a jump, which one of two
+standard deviations does (a likelihood ratio of 9 is one of 2.1).
+"""
 
 
 @dataclass(frozen=True, eq=False)
