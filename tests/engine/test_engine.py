@@ -228,24 +228,37 @@ class TestTiers:
         assert {it.name[-2:] for it in result.references} == {"r0", "r1", "r2"}
         assert result.missing == (MissingEvidence("features", "strong", 1, 0),)
 
-    def test_while_references_lack_something_a_doubt_takes_bounded_time(
-        self, setting: Setting, monkeypatch: pytest.MonkeyPatch
+    @pytest.mark.parametrize(
+        ("pending", "answered"),
+        [
+            (Pending("features", "strongest", 7), "none"),
+            (Pending("matches", "strong (network)", 7), "strongest"),
+        ],
+    )
+    def test_where_features_lack_later_attempts_take_bounded_time(
+        self, setting: Setting, monkeypatch: pytest.MonkeyPatch, pending: Pending, answered: str
     ) -> None:
-        answered = threading.Event()
+        def slow(*_: object) -> Answer:
+            time.sleep(0.6)
+            return rejected()
 
-        def endless(*_: object) -> Answer:
-            assert answered.wait(20)
-            return localized(SURE_INLIERS)
-
-        setting.replies = {"cheap": localized(DOUBTFUL_INLIERS), "strong": endless}
-        setting.engine.references.pending = lambda _: (Pending("matches", "strong (network)", 7),)
-        monkeypatch.setattr("mapless_server.engine.search.LACKING_S", 0.5)
-        begin_s = time.monotonic()
-        result = setting.localize(deadline_s=60.0)
-        assert time.monotonic() - begin_s < 10
-        answered.set()
-        assert (result.tier.extractor.name, [it.reason for it in result.cuts]) == ("cheap", [CutReason.NO_TIME])
-        assert result.missing == (MissingEvidence("matches", "strong (network)", 7),)
+        many = Setting(setting.store, names=("cheap", "strong", "strongest"))
+        many.replies = dict.fromkeys(many.names, rejected())
+        many.localize()  # stores the features of the references
+        many.replies |= {"strong": slow, "strongest": localized(SURE_INLIERS)}
+        many.engine.references.pending = lambda _: (pending,)
+        monkeypatch.setattr("mapless_server.engine.search.LACKING_S", 0.3)
+        result = many.localize()
+        many.close()
+        ended = {(it.rung, it.features): it.outcome for it in result.attempts}
+        assert ended["stronger", "strong"] == "too_few_matches", "it ended, though after the limit"
+        assert result.missing == (MissingEvidence(pending.work, pending.name, 7),)
+        if answered == "none":
+            assert result.attempts[-1].outcome == "unfinished"
+            assert {it.reason for it in result.cuts} == {CutReason.FEATURES_MISSING}
+            assert "references still lack evidence" in hint_of(result).message
+        else:
+            assert (result.tier.extractor.name, result.cuts) == (answered, ())
 
     @pytest.mark.parametrize("error", [Unavailable("the store is away"), NotFound("the scene is gone", field="scene")])
     def test_a_doubtful_answer_is_given_without_the_store(

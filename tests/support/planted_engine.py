@@ -64,16 +64,17 @@ def caller(deadline_s: float = 60.0) -> Caller:
 
 @dataclass
 class Setting:
-    """An engine of two tiers whose method answers what is planted, and which tiers ran."""
+    """An engine of named tiers whose method answers what is planted, and which tiers ran."""
 
     store: Store
     replies: dict[str, Reply] = field(default_factory=dict)
     asked: list[str] = field(default_factory=list)
     seen: list[tuple[View, Sequence[PosedView]]] = field(default_factory=list)
     judges: list[JudgeOptions] = field(default_factory=list)
+    names: tuple[str, ...] = ("cheap", "strong")
 
     def __post_init__(self) -> None:
-        self.extractors = {name: StandInExtractor(name) for name in ("cheap", "strong")}
+        self.extractors = {name: StandInExtractor(name) for name in self.names}
         pipelines = {name: Pipeline(cast(Any, StandInReconstructor())) for name in self.extractors}
 
         def method(

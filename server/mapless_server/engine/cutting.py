@@ -1,4 +1,4 @@
-"""Where the ladder is cut for another reason than what the photograph shows: its caller's failures, or time."""
+"""Where the ladder is cut for another reason than what the photograph shows: failures of the caller, time, evidence."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -35,7 +35,7 @@ def offered(
         chosen = search
         if taken:
             _, first, its_attempt = taken[0]
-            chosen = search.cut(first.name, features_of(its_attempt), CutReason.NO_TIME)
+            chosen = search.cut(first.name, features_of(its_attempt), search.reason_at(search.ends_s))
         taken.append((chosen, rung, attempt))
     return search, taken
 
@@ -46,5 +46,6 @@ def without_unmatched(search: Search, features: str) -> Search:
     assert material is not None
     if not material.unmatched:
         return search
-    search = search.cut(search.rung, features, CutReason.NO_TIME, len(material.unmatched))
+    reason = search.reason_at(search.lacking_until_s)
+    search = search.cut(search.rung, features, reason, len(material.unmatched))
     return search.but(material=replace(material, unmatched=()))

@@ -17,7 +17,7 @@ from mapless_server.method.judge.hypothesis import Attempt, Where, first_attempt
 from mapless_server.method.options import ChosenCamera, StageContext
 from mapless_server.method.rejection import PoseHypothesis
 from mapless_server.scenes import Choice
-from mapless_server.scenes.later import CALIBRATION, Pending
+from mapless_server.scenes.later import FEATURES, Pending
 from mapless_server.scheduling import Job, StageResult, Step, processor_s
 from mapless_server.store import SceneAttributes, SceneState
 
@@ -102,10 +102,11 @@ UNFINISHED = "unfinished", "failed", "out_of_memory"
 
 
 LACKING_S = 2.7
-"""Longest time of a query in whose scene references lack what further attempts use: so its answer comes within 3 s."""
+"""Longest time of a query in whose scene references lack features: so its answer comes within 3 s. The first attempt
+with further features that are stored, or were made in time, may take until the caller's deadline all the same."""
 
 MAKE_S = 1.5
-"""For so long since its begin, such a query makes what they lack. The rest is for attempts with it."""
+"""For so long since its begin, such a query makes what they lack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,10 +262,23 @@ class Search:
         return StageContext(self.context.check, make_until_s=make_until_s, lacking=self.context.lacking)
 
     @property
-    def ends_s(self) -> float:
-        """Time by which it ends: its deadline, or earlier where references lack something for a further attempt."""
-        lacks = self.context.lacking or any(it.work != CALIBRATION for it in self.pending or ())
+    def lacking_until_s(self) -> float:
+        """Time until which references' evidence is waited for: its deadline, or earlier where they lack features.
+
+        Matches that they lack are left out, or made with the query, and need no such limit.
+        """
+        lacks = self.context.lacking or any(it.work == FEATURES for it in self.pending or ())
         return min(self.deadline_s, self.begun_s + LACKING_S) if self.found and lacks else self.deadline_s
+
+    @property
+    def ends_s(self) -> float:
+        """Time by which it ends: its deadline, until an attempt with further features has had a result."""
+        return self.lacking_until_s if any(it.attempt.features for it in self.found) else self.deadline_s
+
+    def reason_at(self, until_s: float) -> CutReason:
+        """The reason of a cut at a time until which an attempt may take: what references lack, or the deadline."""
+        is_lacking = until_s < self.deadline_s and until_s <= self.give_up_s
+        return CutReason.FEATURES_MISSING if is_lacking else CutReason.NO_TIME
 
     @property
     def missing(self) -> tuple[MissingEvidence, ...]:

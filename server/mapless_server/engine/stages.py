@@ -281,7 +281,7 @@ class QueryStages:
         material = search.material
         if material is None or not material.unmatched:
             return False
-        until_s = min(search.give_up_s, search.ends_s)
+        until_s = min(search.give_up_s, search.lacking_until_s)
         until_s = search.start_s + REMATCH_SHARE * (until_s - search.start_s)
         return time.monotonic() + (self._verdicts.tier(search.attempt).pipeline.matcher.pair_s or 0.0) <= until_s
 
@@ -403,6 +403,7 @@ class QueryStages:
         before = search.before or search.attempt
         now_s = time.monotonic()
         give_up_s = min(now_s + TIME_SHARE * (search.deadline_s - now_s), search.ends_s)
+        search = search.but(give_up_s=give_up_s)
         situation, doubts = situation_of(search, self._tiers, self._doubt.promise), verdict.doubts
         following = ladder.further(before, search.tried, doubts, situation)
         search, rungs = cutting.offered(search, following, lambda it: self._verdicts.tier(it).features)
@@ -425,9 +426,8 @@ class QueryStages:
         answered = self._verdicts.answer(search)
         return Done(answered, _ending(answered))
 
-    def _unfinished(
-        self, search: Search, outcome: str = "unfinished", reason: CutReason = CutReason.NO_TIME
-    ) -> Done[Result]:
+    def _unfinished(self, search: Search, outcome: str = "unfinished", reason: CutReason | None = None) -> Done[Result]:
+        reason = reason or search.reason_at(search.ends_s)
         answered = self._verdicts.without_present(search, outcome, reason)
         return Done(answered, _ending(answered))
 

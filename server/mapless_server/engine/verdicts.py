@@ -17,7 +17,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.scenes import ANYWHERE, Choice
 
 from . import tracking
-from .query import CutReason, Result, Tier, Tried
+from .query import CutReason, LadderCut, Result, Tier, Tried
 from .search import UNFINISHED, Search
 
 
@@ -82,7 +82,7 @@ class Verdicts:
         result = self.result(search, chosen, material, verdict.outcome, compares)
         ended = zip(search.attempts, search.tried, strict=True)
         attempts = tuple(replace(it, is_chosen=tried == chosen.attempt) for it, tried in ended)
-        answer = _with_unfinished(result.answer, attempts)
+        answer = _with_unfinished(result.answer, attempts, search.cuts)
         return replace(result, answer=answer, attempts=attempts, cuts=search.cuts, missing=search.missing)
 
     def without_present(self, search: Search, outcome: str, reason: CutReason) -> Result:
@@ -125,13 +125,17 @@ def _other_choices(search: Search, material: Material) -> tuple[Choice, ...]:
     return tuple(it for name, it in chosen.items() if material.choice is None or name != material.choice.descriptor)
 
 
-def _with_unfinished(answer: Answer, attempts: Sequence[Tried]) -> Answer:
+def _with_unfinished(answer: Answer, attempts: Sequence[Tried], cuts: Sequence[LadderCut]) -> Answer:
     """Says in the hint of a rejection which attempt was not finished: repeating the call may then succeed."""
-    rejection, unfinished = answer.outcome, [it for it in attempts if it.outcome in UNFINISHED]
-    if not isinstance(rejection, Rejection) or rejection.hint is None or not unfinished:
+    lacking = [it.rung for it in cuts if it.reason is CutReason.FEATURES_MISSING]
+    rejection, rungs = answer.outcome, lacking or [it.rung for it in attempts if it.outcome in UNFINISHED]
+    if not isinstance(rejection, Rejection) or rejection.hint is None or not rungs:
         return answer
-    untried = next((it.untried for it in ladder.RUNGS if it.name == unfinished[0].rung), "as it is")
-    advice = f"Trying it {untried} was not finished: asking again, when less is asked, may help."
+    untried = next((it.untried for it in ladder.RUNGS if it.name == rungs[0]), "as it is")
+    advice = "asking again, when less is asked, may help."
+    if lacking:
+        advice = "the scene's references still lack evidence, made in the background; asking again later may help."
+    advice = f"Trying it {untried} was not finished: {advice}"
     hint = replace(rejection.hint, message=f"{rejection.hint.message} {advice}")
     return replace(answer, outcome=replace(rejection, hint=hint))
 
