@@ -132,6 +132,12 @@ def begin_change(connection: Connection, scene_key: SceneKey, added_count: int =
     return generation
 
 
+def lock_changes(connection: Connection, scene_key: SceneKey) -> None:
+    """Changes of a scene, which need not exist, wait for the end of the transaction; none is counted."""
+    column = scene_generation.c
+    connection.execute(select(column.generation).where(column.scene_id == scene_key).with_for_update())
+
+
 def forget_removals(connection: Connection, scene_key: SceneKey, until_generation: int) -> None:
     """Deletes the tombstones up to a generation; callers that know an earlier one then read the whole scene."""
     removed = removed_reference.c

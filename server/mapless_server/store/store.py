@@ -137,6 +137,7 @@ class Store(StoreReader):
     ) -> SceneRecord:
         """Changes attributes of a scene, and all of its labels together; None deletes an attribute.
 
+        Labels alone leave the generation as it is: nothing that is computed from a scene depends on them.
         Damaged attributes are replaced if datum, down_in_world and calibration are given; then the unit is the metre
         unless it is given. NotFound if there is no such scene; DataLoss if an attribute that is not given is damaged;
         ContradictingDown if datum and down_in_world do not belong to the same world; DatumWithoutMetres if there would
@@ -149,7 +150,10 @@ class Store(StoreReader):
         given["arbitrary_unit"] = arbitrary_unit
         changes = {name: value for name, value in given.items() if value is not UNCHANGED}
         with self.changing() as connection:
-            queries.begin_change(connection, scene_key)
+            if changes or labels is UNCHANGED:
+                queries.begin_change(connection, scene_key)
+            else:
+                queries.lock_changes(connection, scene_key)
             stored, found = queries.find_scene(connection, scene_key), NO_ATTRIBUTES
             try:
                 found = rows.scene_attributes(stored)
