@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from .diagnostics import Debug, Diagnostics
+from .diagnostics import Debug, Diagnostics, summary_of_missing
 from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform
 
@@ -38,7 +38,7 @@ class Accuracy:
     def calibrated_by(self) -> str:
         """The source of the radii's calibration, as a phrase for a person."""
         if self.calibration == "SELF":
-            return f"by {self.sample_size} references"
+            return f"by {self.sample_size} of the scene's references"
         if self.calibrated:
             return f"on {self.sample_size} photographs" if self.sample_size else "on photographs"
         return ""
@@ -289,7 +289,8 @@ class LocalizationResult:
             text.append(f"  points    {points}")
         text += [f"  depth     {it}" for it in (self.diagnostics.depth_check,) if it is not None]
         text += [f"  cut       {it}" for it in self.diagnostics.ladder_cuts]
-        text += [f"  missing   {it}" for it in self.diagnostics.missing_evidence]
+        if self.diagnostics.ladder_cuts or (self.trust is not None and self.trust < DOUBTFUL_TRUST):
+            text += [f"  missing   {it}" for it in _missing(self.diagnostics)]
         if self.arbitrary_unit:
             text.append("  warning   the scene's unit of length is arbitrary, not the metre")
         if self.scale_source == "NETWORK":
@@ -340,10 +341,15 @@ class Rejected:
             text += [f"  the pose that is too imprecise{frame}:", *pose_lines(pose, it.accuracy, it.arbitrary_unit)]
         check = self.diagnostics.depth_check
         text += [f"  the photograph's depth: {check.refusal}"] if check is not None and check.refusal else []
-        text += [f"  {it}" for it in (*self.diagnostics.ladder_cuts, *self.diagnostics.missing_evidence)]
+        text += [f"  {it}" for it in (*self.diagnostics.ladder_cuts, *_missing(self.diagnostics))]
         if self.diagnostics.captured:
             text.append(f"  {_CAPTURED}")
         return "\n".join(text)
+
+
+def _missing(diagnostics: Diagnostics) -> list[str]:
+    """One line on what references still lack, or none."""
+    return [it for it in (summary_of_missing(diagnostics.missing_evidence),) if it]
 
 
 def rejection_text(reason: str, message: str, hint: Hint | None) -> str:

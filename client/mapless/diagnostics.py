@@ -1,6 +1,6 @@
 """Data that an answer was computed from: references, matches, attempts, software and times."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -103,13 +103,33 @@ class MissingEvidence:
 
     def __str__(self) -> str:
         made = f", {self.made_reference_count} of them made now" if self.made_reference_count else ""
-        return f"{self.reference_count} references had no {self.kind} yet ({self.name}){made}"
+        return f"{self.reference_count} references had no {_KINDS.get(self.kind, self.kind)} yet ({self.name}){made}"
+
+
+_KINDS = {
+    "features": "features for further attempts",
+    "retrieval": "vectors to choose references",
+    "matches": "matches with one another",
+    "calibration": "calibration of radii",
+}
+
+
+def summary_of_missing(missing: Iterable[MissingEvidence]) -> str:
+    """Says what references still lack that could help to localize a photograph; empty if they lack nothing of it."""
+    most = dict[str, int]()
+    for it in missing:
+        left = it.reference_count - it.made_reference_count
+        if left and it.kind != "calibration":
+            most[it.kind] = max(most.get(it.kind, 0), left)
+    lacking = [f"{count} references still lack {_KINDS.get(kind, kind)}" for kind, count in most.items()]
+    lacking[1:] = [it.replace(" references still lack", "") for it in lacking[1:]]
+    return f"{', '.join(lacking)}; ask again later" if lacking else ""
 
 
 _CUT_REASONS = {
     "NO_TIME": "no time",
     "CALLER_FAILS": "this caller's last photographs all failed, and others ask",
-    "FEATURES_MISSING": "features of references are not stored yet",
+    "FEATURES_MISSING": "references still lack features, made in the background",
     "OUT_OF_MEMORY": "too little memory",
     "FAILED": "an error, which is in the server's log",
 }

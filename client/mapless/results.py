@@ -1,6 +1,6 @@
 """Scenes, references, and results of retrieval, audit and coverage."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 
@@ -27,6 +27,14 @@ class PendingWork:
 
     def __str__(self) -> str:
         return f"{self.kind} of {self.reference_count} references ({self.name})"
+
+
+def summary_of(pending: Sequence[PendingWork]) -> str:
+    """Says for each kind of work how many references wait for some of it; empty if nothing is left."""
+    most = dict[str, int]()
+    for it in pending:
+        most[it.kind] = max(most.get(it.kind, 0), it.reference_count)
+    return ", ".join(f"{kind} of {count} references" for kind, count in most.items())
 
 
 @dataclass(frozen=True)

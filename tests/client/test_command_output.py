@@ -16,12 +16,13 @@ from mapless.cameras import read_camera
 from mapless.cli.arguments import make_parser
 from mapless.cli.localize import priors
 from mapless.cli.output import line, plain
-from mapless.diagnostics import DepthCheck
+from mapless.diagnostics import DepthCheck, MissingEvidence
 from mapless.geometry import Camera, RigidTransform, Similarity
 from mapless.groups import GroupRejected, RigLocalization, SequenceLocalization, TrackingJump
 from mapless.lenses import Fisheye
 from mapless.priors import Priors
 from mapless.requests import read_image
+from mapless.results import PendingWork, summary_of
 from mapless.v1 import localization_service_pb2 as pb
 
 
@@ -51,6 +52,30 @@ def test_a_corrected_parameter_of_the_camera_has_its_line() -> None:
     assert [it.strip() for it in lines(localized(intrinsics_checks=checks)) if it.startswith("  camera")] == [
         "camera    focal_x_px is 525.0, the photograph says 530.3 +- 0.8: used"
     ]
+
+
+def test_what_references_lack_is_one_line_for_doubtful_answers() -> None:
+    missing = (
+        MissingEvidence("features", "edgepoint2", 31, 1),
+        MissingEvidence("features", "aliked", 28),
+        MissingEvidence("retrieval", "of aliked", 31, 31),
+        MissingEvidence("matches", "aliked (network)", 29),
+        MissingEvidence("calibration", "auto", 30),
+    )
+    lacking = replace(diagnostics(), missing_evidence=missing)
+    line = "30 references still lack features for further attempts, 29 matches with one another; ask again later"
+    assert lines(rejected(diagnostics=lacking))[-1] == f"  {line}"
+    assert f"  missing   {line}" in lines(localized(diagnostics=lacking, trust=0.01))
+    assert not any("missing" in it for it in lines(localized(diagnostics=lacking, trust=0.9)))
+
+
+def test_pending_work_is_short_and_without_internal_names() -> None:
+    pending = [
+        PendingWork("matches", "a (nearest)", 30),
+        PendingWork("features", "b", 30),
+        PendingWork("features", "c", 7),
+    ]
+    assert summary_of(pending) == "matches of 30 references, features of 30 references"
 
 
 def test_an_arbitrary_unit_is_not_called_metres() -> None:

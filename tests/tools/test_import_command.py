@@ -163,6 +163,7 @@ def test_a_server_that_is_not_there_is_named(folder: Path) -> None:
     assert done.exit_code == 1
     assert "12 not reached" in done.stdout
     assert "stopped:" in done.stdout
+    assert "nothing is lost: the same command goes on once the server answers" in done.stdout
 
 
 def test_a_folder_without_a_layout_is_named(tmp_path: Path) -> None:

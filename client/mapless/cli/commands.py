@@ -16,7 +16,7 @@ from ..names import check_id
 from ..pixels import format_of_image
 from ..provenance import GIVEN, PLACED, Provenance
 from ..requests import NewReference
-from ..results import Reference, Scene
+from ..results import Reference, Scene, summary_of
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import depth_of, limits
 from .output import card, is_confirmed, plain, serving_states, show, table
@@ -100,7 +100,7 @@ def _scene_card(scene: Scene) -> list[str]:
         labels=_labels(scene) or None,
         calibration=f"measured with {calibration.query_count} photographs" if calibration else None,
         created=_minute(scene),
-        background=f"still makes {'; '.join(map(str, scene.pending_work))}" if scene.pending_work else None,
+        background=f"still makes {summary_of(scene.pending_work)}" if scene.pending_work else None,
     )
 
 

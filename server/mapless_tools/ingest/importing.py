@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mapless import Client, MaplessError, Reference
+from mapless import Client, DeadlineExceeded, MaplessError, Reference, Unavailable
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_depth
@@ -240,6 +240,7 @@ def _store(report: ImportReport, options: ImportOptions, settings: Settings, con
         report.stopped = str(error)
     except (MaplessError, ServerFailed) as error:
         report.stopped = str(error)
+        report.is_server_gone = isinstance(error, (DeadlineExceeded, Unavailable, ServerFailed))
 
 
 def _fits_scene(

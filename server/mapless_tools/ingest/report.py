@@ -8,6 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from mapless import PendingWork
+from mapless.results import summary_of
 from mapless_server.method.pairs.readings.alignment import Alignment
 from mapless_server.method.pairs.readings.verdict import Verdict
 from mapless_server.scenes.repeats import same_pose_text
@@ -32,8 +33,8 @@ class ImportReport:
 
     Of the chosen frames, `added` are the ids of stored references, `blank` those without local features, with which
     nothing can be matched; skipped ones exist already. Warnings are contradictions of poses, datum, direction of
-    gravity and unit. `stopped` says why the import ended before its end, `pending` what the server has still to make in
-    the background. The verdict is None if there was no epipolar
+    gravity and unit. `stopped` says why the import ended before its end, `is_server_gone` whether because the server
+    did not answer, `pending` what it has still to make in the background. The verdict is None if there was no epipolar
     check, that with the scene's references if there were none.
     """
 
@@ -48,6 +49,7 @@ class ImportReport:
     skipped: list[Refusal] = field(default_factory=list)
     refused: list[Refusal] = field(default_factory=list)
     stopped: str = ""
+    is_server_gone: bool = False
     seconds: float = 0.0
     pending: Sequence[PendingWork] = ()
     is_dry: bool = False
@@ -141,20 +143,14 @@ def print_report(report: ImportReport, console: Console) -> None:
     if report.untried_count:
         counts.append(f"{report.untried_count} not reached")
     console.print(f"scene {report.scene}: {', '.join(counts)}", markup=False, highlight=False)
-    if left := left_to_do(report.pending):
+    if left := summary_of(report.pending):
         console.print(f"left to the server's background: {left}", markup=False, highlight=False)
     if report.stopped:
         console.print(f"stopped: {report.stopped}", markup=False, highlight=False)
         if report.added:
             console.print("what is in stays in; the same command goes on from there", markup=False)
-
-
-def left_to_do(pending: Sequence[PendingWork]) -> str:
-    """Says for each kind of work how many references wait for some of it; empty if nothing is left."""
-    most = dict[str, int]()
-    for it in pending:
-        most[it.kind] = max(most.get(it.kind, 0), it.reference_count)
-    return ", ".join(f"{kind} of {count} references" for kind, count in most.items())
+        elif report.is_server_gone:
+            console.print("nothing is lost: the same command goes on once the server answers", markup=False)
 
 
 def to_json(report: ImportReport) -> dict[str, Any]:

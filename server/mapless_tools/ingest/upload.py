@@ -119,6 +119,7 @@ class Uploader:
                 self._end(f"the server stays too busy: {error.message}")
             self._one_by_one(items, error)
         except (errors.Unavailable, errors.DeadlineExceeded) as error:
+            self._report.is_server_gone = True
             self._end(f"the server cannot be reached: {error.message}")
         except (errors.AlreadyExists, errors.InvalidArgument, errors.Internal) as error:
             self._one_by_one(items, error)
