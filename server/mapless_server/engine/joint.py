@@ -105,7 +105,7 @@ def _images(queries: Sequence[Query], results: Sequence[Result]) -> list[GroupIm
     for query, result in zip(queries, results, strict=True):
         pipeline = result.tier.pipeline
         match = pipeline.options.match(Variant.BEST, pipeline.matcher.options.guided_similarity)
-        images.append(GroupImage(result.answer, match, query.priors, query.options.intrinsics))
+        images.append(GroupImage(result.answer, match, query.priors, query.options.intrinsics, query.options.shutter))
     return images
 
 

@@ -15,6 +15,8 @@ from mapless.geometry import Array, Camera, RigidTransform, Similarity, rotation
 from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.bundle.intrinsics import read_as
 from mapless_server.method.bundle.priors import IntrinsicsSigma, PositionPrior, Priors
+from mapless_server.method.bundle.readout import RollingShutter
+from mapless_server.method.bundle.shutter import MotionPrior, row_times
 from mapless_server.method.groups.checks import check_mounting, check_tracking, check_unit, hinted_group
 from mapless_server.method.groups.images import GroupImage, rejection_without_matches
 from mapless_server.method.groups.jumps import Jump
@@ -22,6 +24,7 @@ from mapless_server.method.groups.rig import RigEstimate, RigState, solve_rig
 from mapless_server.method.groups.sequence import SequenceEstimate
 from mapless_server.method.groups.start import CHECK_TRACKING
 from mapless_server.method.judge.answer import Answer, Localization
+from mapless_server.method.optim.optimize import perturbed
 from mapless_server.method.optim.rotations import rotation_vector
 from mapless_server.method.pose.generalized import CameraMatches, inlier_count, rig_ransac, scaled_ransac
 from mapless_server.method.pose.pnp import PnpOptions
@@ -176,6 +179,47 @@ def test_errors_are_as_large_as_the_covariance() -> None:
         error = np.concatenate([found.world_from_rig.translation - truth.translation, turn])
         whitened.append(error @ np.linalg.solve(found.covariance, error) / 6)
     assert 0.1 < np.mean(whitened) < 1.0
+
+
+def test_a_motion_that_no_photograph_shows_is_in_the_radii() -> None:
+    """As much as the pose follows each axis of the motion, which moves keypoints by when their rows were read."""
+    shutter, truth = RollingShutter(0.033), [WORLD_FROM_RIG.compose(it) for it in RIG_FROM_CAMERA]
+    images = images_of(random_for("rig motion"), truth, keep=1000)
+    found = [solve_rig([replace(it, shutter=s) for it in images], RIG_FROM_CAMERA) for s in (None, shutter)]
+    still, widened = (it for it in found if isinstance(it, RigEstimate))
+    state, moved = RigState(WORLD_FROM_RIG.inverse(), tuple(RIG_FROM_CAMERA)), list[Array]()
+    distance_m = max(float(np.median(_depths(it, pose))) for it, pose in zip(images, truth, strict=True))
+    for axis in 0.1 * np.sqrt(MotionPrior.of(shutter, distance_m).spread):
+        motions = [state.jacobian(i) @ axis for i in range(len(images))]
+        seen = [_moved(*it, shutter) for it in zip(images, truth, motions, strict=True)]
+        after = solve_rig(seen, RIG_FROM_CAMERA)
+        assert isinstance(after, RigEstimate)
+        turn = rotation_vector(after.world_from_rig.rotation @ still.world_from_rig.rotation.T)
+        moved.append(10 * np.append(after.world_from_rig.translation - still.world_from_rig.translation, turn))
+    expected, added = np.array(moved).T @ moved, widened.covariance - still.covariance
+    np.testing.assert_allclose(np.diag(added), np.diag(expected), rtol=0.4)
+
+
+def _points(image: GroupImage) -> tuple[Any, Array]:
+    support = image.answer.support
+    assert support is not None
+    return support, support.structure.x_in_world[support.matches.point]
+
+
+def _depths(image: GroupImage, world_from_camera: RigidTransform) -> Array:
+    return world_from_camera.inverse().apply(_points(image)[1])[:, 2]
+
+
+def _moved(image: GroupImage, pose: RigidTransform, motion: Array, shutter: RollingShutter) -> GroupImage:
+    """The photograph of a camera that moves while it is read."""
+    support, x_in_world = _points(image)
+    keypoint, query, before = support.matches.keypoint, support.query, pose.inverse()
+    times = row_times(query, shutter)[keypoint]
+    seen = np.array([perturbed(before, t * motion).apply(x) for t, x in zip(times, x_in_world, strict=True)])
+    keypoints = query.features.keypoints.copy()
+    keypoints[keypoint] += query.camera.project(seen) - query.camera.project(before.apply(x_in_world))
+    query = replace(query, features=replace(query.features, keypoints=keypoints))
+    return replace(image, answer=replace(image.answer, support=replace(support, query=query)))
 
 
 def test_the_jacobian_is_that_of_the_cameras_motion() -> None:

@@ -24,6 +24,7 @@ from mapless.geometry import Array, RigidTransform
 from ..bundle.estimate import PosedSupport, Support, observers
 from ..bundle.pose_problem import AdjustOptions
 from ..bundle.priors import NO_PRIORS, IntrinsicsSigma, Priors
+from ..bundle.readout import RollingShutter
 from ..features.limits import INLIER_PX, MIN_INLIERS
 from ..judge.answer import Answer, Localization
 from ..judge.evidence import findable_count, hull_share
@@ -56,12 +57,14 @@ class GroupImage:
         priors: priors on its camera's pose.
         intrinsics: standard deviations of its intrinsics, which the joint covariance contains; None if it contains
             none, for intrinsics that were given.
+        shutter: its read-out by a rolling shutter; None for a global one.
     """
 
     answer: Answer
     match: MatchOptions
     priors: Priors = NO_PRIORS
     intrinsics: IntrinsicsSigma | None = None
+    shutter: RollingShutter | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,6 +81,7 @@ class MatchedImage(Support):
         at_own_depth: (P,) which points have their distance from the photograph's own depth, at `own_pose`.
         motion_covariance: (6, 6) the part of `own_covariance` by the camera's motion during a rolling shutter's
             read-out; None without one.
+        shutter: see GroupImage.
     """
 
     image: int
@@ -88,6 +92,7 @@ class MatchedImage(Support):
     own_trust: float = 0.0
     own_count: int = 0
     motion_covariance: Array | None = None
+    shutter: RollingShutter | None = None
 
     def camera_matches(self, rig_from_camera: RigidTransform) -> CameraMatches:
         """Returns the matches as pixels and points of a camera with this pose in the rig."""
@@ -225,6 +230,7 @@ def _matched_image(index: int, image: GroupImage, support: Support, origin: Arra
         own_trust=own_trust,
         own_count=own_count,
         motion_covariance=support.estimate.motion_covariance if isinstance(support, PosedSupport) else None,
+        shutter=image.shutter,
     )
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform, cross_matrix
 
 from ..bundle.priors import PriorCheck
+from ..bundle.shutter import MotionPrior, row_times
 from ..features.limits import MIN_INLIERS
-from ..optim.optimize import covariance_in_world, perturbed
+from ..optim.optimize import covariance_in_world, perturbed, pose_jacobian
 from ..options import LocalizeOptions
 from ..pose.generalized import inlier_count, rig_ransac
 from ..pose.pnp import PnpOptions
@@ -112,21 +113,41 @@ def solve_rig(
     if doubt:
         return doubt
     world_from_rig = estimate.state.rig_from_world.inverse()
-    covariance = _with_motion(
-        covariance_in_world(estimate.covariance, world_from_rig), estimate.matched, world_from_rig
-    )
+    covariance = covariance_in_world(estimate.covariance, world_from_rig) + _by_motion(estimate.matched, estimate.state)
     return RigEstimate(world_from_rig.shifted(origin), covariance, estimate.matched, trust, estimate.prior_checks)
 
 
-def _with_motion(covariance: Array, matched: Sequence[PosedImage], world_from_rig: RigidTransform) -> Array:
-    """A rig's covariance (6, 6) with that of its motion while rolling shutters read, which is one for all cameras."""
-    by_motion = []
+def _by_motion(matched: Sequence[PosedImage], state: RigState) -> Array:
+    """The part (6, 6) of a rig's covariance by its motion while rolling shutters read, which is one for all cameras."""
+    world_from_rig, by_motion = state.rig_from_world.inverse(), list[Array]()
     for it in matched:
         if it.source.motion_covariance is not None:
             to_rig = np.eye(6)
             to_rig[:3, 3:] = -cross_matrix(world_from_rig.translation - it.world_from_camera.translation)
             by_motion.append(to_rig @ it.source.motion_covariance @ to_rig.T)
-    return covariance + np.mean(by_motion, axis=0) if by_motion else covariance
+    return np.asarray(np.mean(by_motion, axis=0)) if by_motion else _by_unseen_motion(matched, state)
+
+
+def _by_unseen_motion(matched: Sequence[PosedImage], state: RigState) -> Array:
+    """The same where no photograph is localized alone, so that none shows the motion: by all of its prior.
+
+    To first order keypoints are moved by the share of the read-out at which their row was read; see `bundle.shutter`.
+    """
+    information, cross, spread = (np.zeros((6, 6)) for _ in range(3))
+    for it in matched:
+        x_in_world = it.source.structure.x_in_world[it.matches.point[it.inliers]]
+        if not len(x_in_world):
+            continue
+        x_in_camera, camera_from_rig = it.world_from_camera.inverse().apply(x_in_world), state.jacobian(it.source.image)
+        by_rig = np.einsum("aim,ij->ajm", pose_jacobian(it.source.query.camera, x_in_camera), camera_from_rig)
+        information += np.einsum("aim,ajm->ij", by_rig, by_rig)
+        if it.source.shutter is not None:
+            time = row_times(it.source.query, it.source.shutter)[it.matches.keypoint[it.inliers]]
+            cross += np.einsum("aim,ajm->ij", by_rig, by_rig * time)
+            prior = MotionPrior.of(it.source.shutter, float(np.median(x_in_camera[:, 2])))
+            spread = np.maximum(spread, prior.spread)
+    by_motion = np.linalg.pinv(information, hermitian=True) @ cross
+    return covariance_in_world(by_motion @ spread @ by_motion.T, state.rig_from_world.inverse())
 
 
 def _start(
