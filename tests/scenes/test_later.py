@@ -13,6 +13,7 @@ from support.images import encode, textured
 from support.servers import CAMERA, StandInDescriptor, StandInExtractor, pose
 from support.stores import damage
 
+from mapless_server.errors import NetworkNotLoaded
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.matching import CorrespondOptions
 from mapless_server.method.features.views import View
@@ -103,6 +104,36 @@ def test_what_is_left_is_named_until_nothing_is(store: Store) -> None:
     assert background.pending(SCENE) == [Pending("matches", "first (nearest)", 3), Pending("features", LATER, 3)]
     background.match_waiting()
     assert background.pending(SCENE) == [], "the damaged one is not waited for"
+
+
+class NotThere(StandInExtractor):
+    def extract(self, *arguments: Any) -> View:
+        super().extract(*arguments)
+        raise NetworkNotLoaded("later cannot be loaded: no file", 300.0)
+
+
+def test_a_network_that_is_not_loaded_is_asked_once(store: Store, caplog: pytest.LogCaptureFixture) -> None:
+    extractor = NotThere(LATER)
+    background = background_of(store, extractor)
+    background._thread, background._makes_pairs = threading.Thread(), True
+    for _ in range(3):
+        background.match_waiting()
+    assert (len(extractor.seen), caplog.text.count("cannot be loaded"), caplog.text.count("Traceback")) == (1, 1, 0)
+    assert background.pending(SCENE) == [Pending("features", LATER, 3)]
+    background._rests_until_s.clear()  # the time has passed
+    background.match_waiting()
+    assert len(extractor.seen) == 2
+
+
+def test_an_unexpected_failure_is_still_waited_for(store: Store) -> None:
+    class Fails(StandInExtractor):
+        def extract(self, *arguments: Any) -> View:
+            raise ValueError("a fault")
+
+    background = background_of(store, Fails(LATER))
+    background._thread, background._makes_pairs = threading.Thread(), True
+    background.match_waiting()
+    assert background.pending(SCENE) == [Pending("features", LATER, 3)]
 
 
 def test_matches_of_first_features_precede_later_ones() -> None:

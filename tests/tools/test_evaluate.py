@@ -4,6 +4,8 @@ import io
 import json
 import math
 from dataclasses import asdict, replace
+from types import SimpleNamespace
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,13 +16,14 @@ from rich.console import Console
 from support.evaluations import evaluation, query_result
 
 from bench.report import BenchResult, BenchScene, Figures, Latency, as_json, markdown, met
-from mapless import IntrinsicsCheck
+from mapless import IntrinsicsCheck, PendingWork
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.method.bundle.estimate import USUAL_GAP, Accuracy
 from mapless_server.scenes.calibration.fit import FitOptions, LeftOut
 from mapless_server.services.messages.radii import Conditions
 from mapless_tools.charts import INK, figure_of, inline_svg, new_axes, plot, use_logarithms
 from mapless_tools.child import Memory
+from mapless_tools.evaluate import run
 from mapless_tools.evaluate.calibrate import fit_calibration
 from mapless_tools.evaluate.metrics import QueryResult, pose_error, quantile, summarize
 from mapless_tools.evaluate.plan import EvaluationOptions, split_frames
@@ -35,6 +38,20 @@ def result(translation: float, rotation_deg: float = 0.01, latency_ms: float = 1
 
 
 MISSED = result(math.inf)
+
+
+def test_waiting_for_features_ends_where_none_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stands:
+        looks = iter([3, 2, *[2] * 1000])
+
+        def get_scene(self, scene: str) -> SimpleNamespace:
+            return SimpleNamespace(pending_work=[PendingWork("features", "strong", next(self.looks))])
+
+    monkeypatch.setattr(run, "_LOOK_S", 0.01)
+    monkeypatch.setattr(run, "LONGEST_STANDSTILL_S", 0.1)
+    client: Any = Stands()
+    with pytest.raises(TimeoutError, match=r"scene s: the server has found no further features .*, 2 references lack"):
+        run.await_features(client, "s")
 
 
 class TestSplit:

@@ -18,7 +18,7 @@ from functools import partial
 
 from mapless_server.bounds import check_bounds
 from mapless_server.cache import LruCache
-from mapless_server.errors import DataLoss, NotFound
+from mapless_server.errors import DataLoss, NetworkNotLoaded, NotFound
 from mapless_server.method.features.matching import StoredPair
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
@@ -135,6 +135,7 @@ class BackgroundMatching:
         self._thread: threading.Thread | None = None
         self._makes_pairs = False
         self._complete: LruCache[int] = LruCache(_COMPLETE_SCENES)
+        self._rests_until_s: dict[Work, float] = {}
         self._step_begin_s = 0.0
         self._busy_s = -math.inf
         self._use_is_due_s = -math.inf
@@ -269,6 +270,8 @@ class BackgroundMatching:
         self.maintain()
         self._calibrate_next(is_first=True)
         for work in works:
+            if time.monotonic() < self._rests_until_s.get(work, -math.inf):
+                continue
             claim = self._pairs.claim(work.name, self._progress[work.name])
             if claim is not None:
                 return work, claim
@@ -280,7 +283,10 @@ class BackgroundMatching:
         self._counted_s = time.monotonic()
 
     def _work_on_claimed(self, library: ReferenceLibrary, work: Work, claim: Claim) -> None:
-        """Does work on one reference, or postpones it if that fails."""
+        """Does work on one reference, or postpones it if that fails.
+
+        Where a network cannot be loaded all of this work rests: it would fail with every reference.
+        """
         until_s = time.monotonic() + CLAIM_S / 3
         begin_s = time.thread_time()
         try:
@@ -290,13 +296,18 @@ class BackgroundMatching:
         except NotFound:  # the reference was deleted
             self._pairs.postpone(work.name, claim)
             return
+        except NetworkNotLoaded as error:
+            self._rests_until_s[work] = time.monotonic() + error.retry_after_s
+            self._observer.count("background_failures")
+            log.warning("%s of %s rest for %.0f s: %s", what_of(work), name_of(work), error.retry_after_s, error)
+            made, is_complete = {}, False
         except Exception as error:
-            wait_s = self._pairs.postpone(work.name, claim)
+            is_damaged = isinstance(error, DataLoss)
+            wait_s = self._pairs.postpone(work.name, claim, is_damaged)
             self._observer.count("background_failures")
             message = "reference %s of scene %s could not be described or matched, next time in %.0f s: %s"
-            is_expected = isinstance(error, DataLoss)
             log.warning(
-                message, claim.reference_id, claim.scene_key, wait_s, error, exc_info=None if is_expected else error
+                message, claim.reference_id, claim.scene_key, wait_s, error, exc_info=None if is_damaged else error
             )
             return
         self._pairs.add(work.name, claim, made, is_complete)

@@ -186,12 +186,16 @@ class PairStore:
             due_us = None if is_complete else rows.now_us()
             connection.execute(_of_claim(matching, claim).values(due_time_us=due_us, failure_count=0))
 
-    def postpone(self, matching: str, claim: Claim) -> float:
-        """Ends the claim of a reference that failed; returns the seconds until it may be claimed again."""
+    def postpone(self, matching: str, claim: Claim, is_damaged: bool = False) -> float:
+        """Ends the claim of a reference that failed; returns the seconds until it may be claimed again.
+
+        Only one that `is_damaged` counts as complete, see `count_complete`: its number of failures is positive.
+        """
         column = reference_matching.c
         count = select(column.failure_count).where(column.reference_key == claim.key, column.matching == matching)
         with self._database.write() as connection:
-            wait_s, values = next_try(connection.scalar(count) or 0)
+            wait_s, values = next_try(abs(connection.scalar(count) or 0))
+            values["failure_count"] *= 1 if is_damaged else -1
             connection.execute(_of_claim(matching, claim).values(values))
         return wait_s
 
@@ -209,7 +213,7 @@ class PairStore:
     def count_complete(self, scene_key: SceneKey, matchings: Collection[str]) -> dict[str, int]:
         """Numbers of references of a scene whose pairs are all stored, by matching; and of all of them, by "".
 
-        Those whose pairs could not be made, which are tried again after a while, count as if they were.
+        Damaged ones, which are tried again after a while, count as if theirs were.
         """
         column = reference_matching.c
         complete: Select[Any] = (

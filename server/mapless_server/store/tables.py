@@ -149,6 +149,7 @@ reference_matching = Table(
     Column("matching", _Matching, primary_key=True),
     # When a server may claim it: the end of a claim, or of the wait after a failure; null when its pairs are stored.
     Column("due_time_us", BigInteger),
+    # In a row; negative if the last one was not because the reference is damaged.
     Column("failure_count", Integer, nullable=False, server_default=_NONE_YET),
     Index("reference_matching_by_due_time", "matching", "due_time_us"),
 )

@@ -22,6 +22,8 @@ from .references import Matcher, PlannedQuery, check_images, rank_by_matches
 SCENE = "evaluation"
 
 _LOOK_S = 1.0
+LONGEST_STANDSTILL_S = 600.0
+"""Twice as long as a network that could not be loaded rests."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +86,11 @@ def store_references(client: Client, scene: str, references: Sequence[Frame], pr
 
 
 def await_features(client: Client, scene: str, progress: Progress = lambda *_: None) -> None:
-    """Waits until the server has found the features that doubtful photographs need: their answers depend on them."""
-    total = 0
+    """Waits until the server has found the features that doubtful photographs need: their answers depend on them.
+
+    TimeoutError if none were found for `LONGEST_STANDSTILL_S`.
+    """
+    total, least, found_s = 0, math.inf, time.monotonic()
     while True:
         pending = client.get_scene(scene).pending_work
         left = max((it.reference_count for it in pending if it.kind == "features"), default=0)
@@ -94,6 +99,11 @@ def await_features(client: Client, scene: str, progress: Progress = lambda *_: N
             progress("finding further features", total - left, total)
         if not left:
             return
+        if left < least:
+            least, found_s = left, time.monotonic()
+        elif time.monotonic() - found_s >= LONGEST_STANDSTILL_S:
+            why = f"the server has found no further features for {LONGEST_STANDSTILL_S:.0f} s"
+            raise TimeoutError(f"scene {scene}: {why}, {left} references lack some; its log says why")
         time.sleep(_LOOK_S)
 
 
