@@ -16,7 +16,8 @@ from mapless.geometry import Array, RigidTransform
 from ..bundle.priors import conflict_threshold
 from ..features.views import PosedView
 from ..judge.answer import Answer, Localization
-from ..judge.hints import FEW_MATCHES, MANY_MATCHES
+from ..judge.cameras import MANY_MATCHES
+from ..judge.hints import FEW_MATCHES
 from ..pairs.readings.conventions import CONVENTIONS, Convention
 from ..pairs.readings.explanation import MOST_NAMED
 from ..rejection import Advice, Hint, Rejection, RejectionReason
