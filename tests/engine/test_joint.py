@@ -17,6 +17,7 @@ from mapless_server.method.features.views import ReferenceErrors
 from mapless_server.method.groups.images import GroupImage
 from mapless_server.method.groups.rig import RigEstimate
 from mapless_server.method.groups.sequence import SequenceEstimate
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.rejection import Advice, Rejection, RejectionReason
 from mapless_server.store import SceneAttributes, SceneState
 
@@ -36,7 +37,7 @@ def joint(
         matcher=SimpleNamespace(options=SimpleNamespace(guided_similarity=0.7)),
     )
     narrowing = SimpleNamespace(contradiction=lambda *_: "")
-    options = SimpleNamespace(coverage=0.95, intrinsics=None)
+    options = LocalizeOptions(coverage=0.95)
     query = SimpleNamespace(options=options, priors=NO_PRIORS, narrowing=narrowing)
     results = [
         SimpleNamespace(
