@@ -25,7 +25,7 @@ def set_field(message: Message, path: str, value: Any) -> None:
 
 
 def essence(answer: pb.LocalizeResponse, with_stages: bool = False) -> bytes:
-    """All of an answer but its times and the name of the call; with the names of its stages where that is asked for."""
+    """All of an answer but its times, the call's name and what the background lacks; stages only where asked for."""
     kept = pb.LocalizeResponse()
     kept.CopyFrom(answer)
     for name in (
@@ -33,6 +33,7 @@ def essence(answer: pb.LocalizeResponse, with_stages: bool = False) -> bytes:
         "queue_duration",
         "total_duration",
         "processor_duration",
+        "missing_evidence",
         *([] if with_stages else ["stages"]),
     ):
         kept.diagnostics.ClearField(name)

@@ -1,7 +1,7 @@
 """The differences between an answer and the same answer computed again.
 
-Durations, the call's id, the server's version and whether it was captured are no part of an answer; versions, settings
-and weights are compared separately.
+Durations, the call's id, the server's version, whether it was captured and what the server had still to make are no
+part of an answer; versions, settings and weights are compared separately.
 """
 
 import math
@@ -19,7 +19,7 @@ from mapless_server.services.capture.calls import Response, diagnostics_of
 
 DESCRIBE = "describe"
 """The stage in which a server extracts the features that a replay already has."""
-NO_ANSWER = ("request_id", "server_version", "captured", "attempts") + tuple(
+NO_ANSWER = ("request_id", "server_version", "captured", "attempts", "missing_evidence") + tuple(
     f"{name}_duration" for name in ("queue", "total", "processor")
 )
 """Fields of diagnostics that are no part of the answer."""
