@@ -40,7 +40,7 @@ class ReadoutDirection(str, Enum):
     BOTTOM_TO_TOP = "bottom_to_top"
     LEFT_TO_RIGHT = "left_to_right"
     RIGHT_TO_LEFT = "right_to_left"
-    """Of a raster that was turned clockwise by a quarter, as upright photographs of phones held upright."""
+    """The raster was turned clockwise by a quarter, as upright photographs of phones held upright."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 UNKNOWNS = (0, 4, 10)
-"""Of the query beside its pose: none, errors of its intrinsics, and its motion during the read-out besides."""
+"""Unknowns of the query beside its pose: none, errors of its intrinsics, and its motion during the read-out besides."""
 
 
 def planted(case: str, unknowns: int) -> tuple[BundleProblem, Bundle]:

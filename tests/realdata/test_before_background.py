@@ -23,7 +23,7 @@ NEEDED = ("edgepoint2-l64", "aliked-n16", "aliked-lightglue")
 def test_they_are_answered_in_3_s_and_say_what_was_missing(
     photographs: Callable[[str], Dataset], tmp_path: Path
 ) -> None:
-    """Of another place, and turned by 180 degrees; on a machine that does nothing else."""
+    """Photographs of another place, and turned by 180 degrees; on a machine that does nothing else."""
     weights = Path(os.environ.get("TEST_WEIGHTS", "nowhere"))
     for name in NEEDED:
         if not (weights / f"{name}.safetensors").is_file():

@@ -161,7 +161,7 @@ def test_radii_contain_the_truth_as_often_as_stated(photographs: Photographs) ->
 
 @pytest.mark.nightly
 def test_eight_references_calibrate_the_radii_of_a_scene(photographs: Photographs) -> None:
-    """Of the office, where generic radii are too small."""
+    """The office is the case: its generic radii are too small."""
     photographs(OFFICE)
     answers = left_out(OFFICE, 10)
     radii = []

@@ -1,4 +1,4 @@
-"""What is no single query: import, start, and many clients at once; each turn has a server of its own."""
+"""Import, start, and many clients at once; each turn has a server of its own."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -259,7 +259,7 @@ class LadderCut:
 
 @dataclass(frozen=True)
 class MissingEvidence:
-    """What references lacked for the attempts at a photograph, since the background has not made it yet.
+    """Evidence that references lacked for the attempts at a photograph, since the background has not made it yet.
 
     Attributes:
         kind: "features", "retrieval" for vectors by which references are chosen, "matches" or "calibration".

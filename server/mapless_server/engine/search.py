@@ -282,7 +282,7 @@ class Search:
 
     @property
     def missing(self) -> tuple[MissingEvidence, ...]:
-        """What references lacked for further attempts: what they were found to lack, then what waits in the scene."""
+        """Evidence that references lack for further attempts: found lacking first, then what waits in the scene."""
         if not self.found:
             return ()
         waiting = {(it.work, it.name): it.reference_count for it in self.pending or ()}

@@ -45,7 +45,7 @@ class ReferenceSource(Protocol):
         ...
 
     def pending(self, scene_key: SceneKey) -> Sequence[Pending]:
-        """What the background has still to make in a scene."""
+        """Work that is left to the background in a scene."""
         ...
 
     def sample(self, scene_key: SceneKey, among: Sequence[str], count: int, context: StageContext) -> Sequence[str]:

@@ -282,7 +282,7 @@ static void corners(const DescriptorHead *head, const double keypoint[2], Index 
 /* Samples (count, J) of the map at keypoints (count, 2), x and y in pixels of the photograph. 0 without memory. */
 static int sample(const DescriptorHead *head, const double *keypoints, Index count, float *samples) {
     const Index width = head->width, height = head->height, joint = head->joint, size = width * height;
-    /* Of each pixel its row in the map, or -1; columns of the pixels in the map; where they end in each row. */
+    /* The row of each pixel in the map, or -1; columns of the pixels in the map; where they end in each row. */
     Index *rows = malloc((size_t)(2 * size + height) * sizeof(Index)), *columns = rows + size, *row_end = columns + size;
     uint8_t *needed = calloc((size_t)size, 1);
     float *memory = calloc((size_t)((RING + 1) * (width + 2) * joint + width * joint), sizeof(float)), *map = NULL;

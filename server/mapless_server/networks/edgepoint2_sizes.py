@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Describe = Callable[[NDArray[np.float64]], NDArray[np.float32]]
-"""What returns descriptors (N, D), not normalized, at keypoints (N, 2) of a photograph, x and y in pixels."""
+"""Returns descriptors (N, D), not normalized, at keypoints (N, 2) of a photograph, x and y in pixels."""
 
 MULTIPLE_PX = 32
 """Sides of the images that the layers take; `EdgePoint2` pads others."""

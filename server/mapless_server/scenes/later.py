@@ -1,4 +1,4 @@
-"""What of a reference is made in the background: its further features; and the order in which the rest is made."""
+"""Further features of references, made in the background; and the order in which the rest is made."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -61,7 +61,7 @@ class Pending:
 
 
 def what_of(work: Work) -> str:
-    """What is made, for `Pending`."""
+    """Kinds of work, for `Pending`."""
     return FEATURES if isinstance(work, LaterFeatures) else MATCHES
 
 

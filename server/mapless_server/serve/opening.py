@@ -1,4 +1,4 @@
-"""What a server needs before it listens: the store, and who makes the engine. Nothing here imports what computes.
+"""The parts a server needs before it listens: the store, and who makes the engine. Nothing here imports what computes.
 
 Imports take most of the time of a start: numpy, SQLAlchemy, gRPC and messages 0.4 s, scipy and the method 0.3 s. What
 computes is imported, and its weights loaded, by `make_engine` in a thread; calls that need the store are answered.

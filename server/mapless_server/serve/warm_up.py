@@ -44,7 +44,7 @@ MAX_ERROR_M = 0.1
 _LIMIT_S = 600.0  # networks may be compiled by the first photograph
 _CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5)
 _SMALL_CAMERA = _CAMERA.resized(320, 240)
-"""Of the references and the first query: describing these costs a quarter."""
+"""Camera of the references and the first query: describing these costs a quarter."""
 _CENTRES_X_M = (-0.6, 0.0, 0.6)
 _QUERY_X_M = 0.25
 _WALLS = ((4.0, 4.0), (2.5, 0.8))

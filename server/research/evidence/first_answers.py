@@ -29,7 +29,7 @@ from research.places import OFFICE, ONE_PLACE, SHORT, Scenes, spread
 from .page import Measurement, Row
 
 PHOTOGRAPHS, QUERIES = 16, 8
-"""Of each place; of the office all are asked."""
+"""Numbers for each place; of the office all are asked."""
 NEAREST = (2, 3, 10)
 TURN_DEG = 15.0
 """A reference that looks so far elsewhere counts as twice as far away."""
