@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -159,11 +159,26 @@ class Caller:
 
 
 @dataclass(frozen=True, eq=False)
+class SceneQuestion:
+    """A scene in which a photograph may have been taken, and what the request's priors say in its world.
+
+    Attributes:
+        scene_key: the scene.
+        narrowing, priors, attributes: as of `Query`.
+    """
+
+    scene_key: SceneKey
+    narrowing: Narrowing
+    priors: Priors = NO_PRIORS
+    attributes: SceneAttributes | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class Query:
     """A photograph to localize.
 
     Attributes:
-        scene_key: the scene.
+        scene_key: the scene; of several, the one of the present attempt.
         reference_ids: references to compare it with; if empty, `reference_count` references of the scene are chosen.
         photo: the photograph.
         narrowing: limits of the camera's pose, for choosing references and for checking the answer.
@@ -176,6 +191,8 @@ class Query:
             alone.
         is_generic: whether what was measured in the scene is not used for radii and trust.
         attributes: the scene's attributes by which the priors were converted to its world; None if by none.
+        scenes: several scenes among which the photograph's is found, in the order of the request; empty for one.
+        prior_scene: the one of them in whose world a pose prior was given; None if none was.
     """
 
     scene_key: SceneKey
@@ -190,6 +207,13 @@ class Query:
     is_part: bool = False
     is_generic: bool = False
     attributes: SceneAttributes | None = None
+    scenes: Sequence[SceneQuestion] = ()
+    prior_scene: SceneKey | None = None
+
+    def in_scene(self, question: SceneQuestion) -> Query:
+        """The query in one of its scenes."""
+        it = question
+        return replace(self, scene_key=it.scene_key, narrowing=it.narrowing, priors=it.priors, attributes=it.attributes)
 
     @property
     def chooses(self) -> bool:

@@ -111,12 +111,14 @@ class PoseHypothesis:
         inlier_count: keypoints of the photograph with an inlier match with any reference.
         references: names of the references that support it; of one of two hypotheses, more than the other.
         covariance: (6, 6) as of `Localization`, of a pose that is only too uncertain; None for one of two.
+        world: name of the world that the pose is in, of several scenes: the scene's; empty for one.
     """
 
     world_from_camera: RigidTransform
     inlier_count: int
     references: tuple[str, ...]
     covariance: Array | None = None
+    world: str = ""
 
 
 @dataclass(frozen=True)
