@@ -1,9 +1,9 @@
 """Persistence: scenes and references with their images and features, in one transactional database.
 
 May import security, method and images. Begin with `Store` (store.py), whose values are in `records`; `tables` is the
-schema. Results of work in the background are in `pairs` (matches of pairs of references) and `calibrations`. Rows
-become values in `rows` and `codec`, which check every byte. `sqlite` and `postgresql` are the databases; `backup` and
-`verify` are what the `store` commands do.
+schema. The scenes that one query searches are found in `scene_groups`. Results of work in the background are in `pairs`
+(matches of pairs of references) and `calibrations`. Rows become values in `rows` and `codec`, which check every byte.
+`sqlite` and `postgresql` are the databases; `backup` and `verify` are what the `store` commands do.
 """
 
 from mapless_server.cache import LruCache
@@ -13,7 +13,9 @@ from .records import (
     ContradictingDown,
     DatumWithoutMetres,
     DescribedReference,
+    GroupedScene,
     IndexedReference,
+    NamedScenes,
     NewReference,
     ReferenceRecord,
     SceneAttributes,

@@ -27,7 +27,16 @@ from .deletion import PendingDeletions
 from .depth_images import encode_depth_image
 from .postgresql import PostgresqlDatabase
 from .reader import NAME_CACHE_BYTES, NO_LABELS, StoreReader, observed
-from .records import DescribedReference, NewReference, ReferenceRecord, SceneAttributes, SceneRecord
+from .records import (
+    DescribedReference,
+    GroupedScene,
+    NamedScenes,
+    NewReference,
+    ReferenceRecord,
+    SceneAttributes,
+    SceneRecord,
+)
+from .scene_groups import SceneGroups
 from .sqlite import SqliteDatabase
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
@@ -55,6 +64,7 @@ class Store(StoreReader):
     ) -> None:
         super().__init__(database, described, name_cache_bytes)
         self._pending_deletions = PendingDeletions(database)
+        self._groups = SceneGroups(database, name_cache_bytes)
 
     @staticmethod
     def open(data_dir: Path, cache_bytes: int = DEFAULT_CACHE_BYTES) -> Store:
@@ -103,6 +113,22 @@ class Store(StoreReader):
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+    @observed
+    def find_scenes(self, tenant: str, labels: Mapping[str, str] = NO_LABELS) -> tuple[GroupedScene, ...]:
+        """All scenes of a tenant with all these labels, ordered by id, at one moment.
+
+        Where only this process writes, the database is asked only after a change.
+        """
+        return self._groups.find(tenant, labels, self._state)
+
+    @observed
+    def find_scenes_named(self, scene_keys: Sequence[SceneKey]) -> NamedScenes:
+        """Up to 64 scenes by their keys, and the keys of those that do not exist, at one moment.
+
+        Cached as of `find_scenes`. ValueError for more keys, or one that occurs twice.
+        """
+        return self._groups.find_named(scene_keys, self._state)
 
     @observed
     def create_scene(

@@ -1,0 +1,81 @@
+"""The scenes that one query searches: those of a tenant with some labels, or some by their keys.
+
+Each look-up is one statement. Where only this process writes, it is executed again only after a change.
+"""
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from sqlalchemy import Row, Select
+
+from mapless_server.cache import LruCache
+from mapless_server.security import SceneKey
+
+from . import queries, rows
+from .database import Database
+from .records import GroupedScene, NamedScenes
+from .tables import scene, scene_generation
+
+MAX_NAMED_SCENES = 64
+"""Scenes that can be looked up by their keys at once."""
+SCENE_BYTES = 1400
+"""About the size of a GroupedScene with a datum in memory."""
+
+_COLUMNS = (
+    scene.c.scene_id,
+    scene.c.create_time_us,
+    scene.c.attributes,
+    scene.c.attributes_sha256,
+    scene_generation.c.generation,
+)
+
+
+class SceneGroups:
+    """Looks up scenes in a database, and remembers what was found; thread-safe.
+
+    The `state` of each method is an object that the store replaces with every change.
+    """
+
+    def __init__(self, database: Database, cache_bytes: int) -> None:
+        self._database = database
+        # The latest group stays however large it is: each query of a tenant may search all of its scenes.
+        self._found: LruCache[tuple[object, tuple[GroupedScene, ...]]] = LruCache(cache_bytes, cache_bytes > 0)
+
+    def find(self, tenant: str, labels: Mapping[str, str], state: object) -> tuple[GroupedScene, ...]:
+        """Scenes of a tenant with all these labels, ordered by id."""
+        return self._look_up(
+            (tenant, frozenset(labels.items())), lambda: queries.select_scenes_of(tenant, "", labels), state
+        )
+
+    def find_named(self, keys: Sequence[SceneKey], state: object) -> NamedScenes:
+        """Scenes by their keys; ValueError for more than `MAX_NAMED_SCENES` keys, or one that occurs twice."""
+        names = tuple(keys)
+        if len(names) > MAX_NAMED_SCENES:
+            raise ValueError(f"keys must have at most {MAX_NAMED_SCENES} items, has {len(names)}")
+        if len(set(names)) < len(names):
+            raise ValueError("keys must not have the same item twice")
+        found = self._look_up(names, lambda: queries.select_scenes().where(scene.c.scene_id.in_(names)), state)
+        by_key = {it.scene_key: it for it in found}
+        return NamedScenes(
+            tuple(by_key[it] for it in names if it in by_key), tuple(it for it in names if it not in by_key)
+        )
+
+    def _look_up(self, name: Hashable, statement: Callable[[], Select[Any]], state: object) -> tuple[GroupedScene, ...]:
+        before = self._found.get(name)
+        if before is not None and before[0] is state and not self._database.is_shared:
+            return before[1]
+        known: dict[str, GroupedScene] = {it.scene_key: it for it in before[1]} if before is not None else {}
+        wanted: Select[Any] = statement().with_only_columns(*_COLUMNS)
+        with self._database.read() as connection:
+            stored = connection.execute(wanted).all()
+        found = tuple(_same_or_new(known.get(row.scene_id), row) for row in stored)
+        self._found.put(name, (state, found), SCENE_BYTES * (1 + len(found)))
+        return found
+
+
+def _same_or_new(known: GroupedScene | None, row: Row[Any]) -> GroupedScene:
+    """The scene of a row: the known one, if it has not changed since."""
+    if known is not None and (known.generation, known.create_time_us) == (row.generation, row.create_time_us):
+        return known
+    return GroupedScene(SceneKey(row.scene_id), row.generation, row.create_time_us, partial(rows.scene_attributes, row))
