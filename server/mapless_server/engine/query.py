@@ -298,6 +298,25 @@ class MissingEvidence:
     made_count: int = 0
 
 
+@dataclass(frozen=True)
+class SceneTried:
+    """A scene of several, as far as its references are among those of all that resemble a photograph most.
+
+    Attributes:
+        scene_key: the scene.
+        reference_count: number of these references.
+        similarity: largest similarity of one of them, see `RankedReference`.
+        match_count: most matches of the photograph with one of them; 0 where no other scene had any, which needs none.
+        attempted: whether a pose was looked for in the scene.
+    """
+
+    scene_key: SceneKey
+    reference_count: int
+    similarity: float
+    match_count: int = 0
+    attempted: bool = False
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The answer to a query, and the data that it was computed from.
@@ -318,6 +337,9 @@ class Result:
         missing: what references lacked for further attempts.
         camera: the camera that was chosen for a photograph without intrinsics; None if it came with some, or none was
             found.
+        scene_key: the scene that the answer's references are of; None if none of several scenes has a reference.
+        scenes: of several scenes, those that resemble the photograph most, the one tried first coming first.
+        searched_scene_count: number of scenes in which references were looked for.
     """
 
     answer: Answer
@@ -333,6 +355,9 @@ class Result:
     cuts: tuple[LadderCut, ...] = ()
     missing: tuple[MissingEvidence, ...] = ()
     camera: ChosenCamera | None = None
+    scene_key: SceneKey | None = None
+    scenes: tuple[SceneTried, ...] = ()
+    searched_scene_count: int = 1
 
     @property
     def generation(self) -> int:

@@ -116,6 +116,7 @@ class Verdicts:
             material.attributes,
             search.seconds(self.tier(search.attempt).features),
             camera=material.camera,
+            scene_key=search.query.scene_key,
         )
 
 
