@@ -31,12 +31,8 @@ from mapless_server.services.messages.groups import (
     session_from_rig_from_message,
     session_poses_from_message,
 )
-from mapless_server.services.messages.queries import (
-    MAX_CANDIDATES,
-    MAX_REFERENCES,
-    needs_attributes,
-    query_from_message,
-)
+from mapless_server.services.messages.priors import needs_attributes
+from mapless_server.services.messages.queries import MAX_CANDIDATES, MAX_REFERENCES, query_from_message
 from mapless_server.store import SceneAttributes
 
 from . import messages

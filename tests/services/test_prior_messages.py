@@ -15,7 +15,7 @@ from mapless.scenes import Calibration, unit_vector
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless.wire import FieldError
-from mapless_server.services.messages.queries import UNKNOWN_HEIGHT_SIGMA_M, needs_attributes, priors_from_message
+from mapless_server.services.messages.priors import UNKNOWN_HEIGHT_SIGMA_M, needs_attributes, priors_from_message
 from mapless_server.services.messages.references import changes_from_message
 from mapless_server.store import SceneAttributes
 

@@ -42,7 +42,8 @@ from .messages.groups import (
     session_poses_from_message,
     with_tracked_motion,
 )
-from .messages.queries import needs_attributes, query_from_message, scene_key_from_name
+from .messages.priors import needs_attributes
+from .messages.queries import query_from_message, scene_key_from_name
 from .watching import Watcher, Watchers
 
 if TYPE_CHECKING:  # services do not load what computes

@@ -33,9 +33,9 @@ from mapless_server.store import (
 )
 
 from .messages.enums import message_of
+from .messages.priors import priors_from_message
 from .messages.queries import (
     photo_from_message,
-    priors_from_message,
     reference_ids_from_names,
     reference_key_from_name,
     scene_key_from_name,

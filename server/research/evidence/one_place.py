@@ -25,7 +25,7 @@ from mapless_server.method.options import DoubtOptions, LocalizeOptions, StageCo
 from mapless_server.method.pairs.correspond import make_matcher
 from mapless_server.method.pipeline import Pipeline, prepare, reconstruct
 from mapless_server.method.rejection import Rejection, RejectionReason
-from mapless_server.services.messages.queries import priors_from_message
+from mapless_server.services.messages.priors import priors_from_message
 from mapless_server.store.records import SceneAttributes
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.references import choose_references

@@ -35,14 +35,13 @@ from .answers import (
     set_used_intrinsics,
 )
 from .enums import enum_to_message, message_of
+from .priors import needs_attributes, priors_from_message
 from .queries import (
     MAX_CANDIDATES,
     MAX_REFERENCES,
     check_capture_time,
-    needs_attributes,
     options_from_message,
     photo_from_message,
-    priors_from_message,
     reference_count_from_message,
     reference_ids_from_names,
     with_depth,
