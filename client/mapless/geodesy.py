@@ -235,6 +235,15 @@ def world_from_enu_at(place: GeoPosition, datum: Datum) -> RigidTransform:
     return datum.ecef_from_world().inverse().compose(ecef_from_enu_at(place))
 
 
+def world_from_other_world(datum: Datum, other: Datum) -> RigidTransform:
+    """The pose of another scene's world in a scene's world, both placed on the Earth by their datums.
+
+    world_from_other = (ecef_from_world)^-1 ecef_from_other. It is as exact as the datums are, about the metres of a
+    satellite receiver and the degrees of a compass, unless both were surveyed.
+    """
+    return datum.ecef_from_world().inverse().compose(other.ecef_from_world())
+
+
 def geopose(world_from_camera: RigidTransform, datum: Datum) -> GeoPose:
     """The GeoPose of a camera (OpenCV's axes) in a scene's world."""
     place = geodetic_from_world(world_from_camera.translation, datum)

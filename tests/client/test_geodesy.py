@@ -23,6 +23,7 @@ from mapless.geodesy import (
     pose_from_geopose,
     world_from_enu_at,
     world_from_geodetic,
+    world_from_other_world,
 )
 from mapless.geometry import Array, Quaternion, RigidTransform, rotation_from_vector
 
@@ -294,3 +295,10 @@ def test_json_that_is_no_geopose_is_refused(part: str, name: str, value: object)
 def test_what_is_not_even_an_object_is_refused(content: object) -> None:
     with pytest.raises(ValueError, match="must be a number"):
         GeoPose.from_json(content)
+
+
+@given(datum, datum, offset)
+def test_one_world_in_another_is_where_the_earth_has_it(here: Datum, there: Datum, x_in_there: Array) -> None:
+    place = geodetic_from_world(x_in_there, there)
+    moved = world_from_other_world(here, there).apply(x_in_there)
+    np.testing.assert_allclose(moved, world_from_geodetic(place, here), atol=1e-5)

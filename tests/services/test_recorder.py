@@ -109,7 +109,8 @@ def answer(recorder: Recorder, tenant: str = "default", *references: PosedView) 
     """The answer to a call that was computed from these references."""
     call = Call("id", time.monotonic(), math.inf, Principal(tenant=tenant))
     query = SimpleNamespace(photo=SimpleNamespace(field="image"))
-    result = SimpleNamespace(choice=None, references=references, generation=1, attributes=SceneAttributes())
+    known = {"choice": None, "generation": 1, "attributes": SceneAttributes(), "scene_key": "s"}
+    result = SimpleNamespace(references=references, **known)
     part = cast(Any, (query, result))
     response = pb.LocalizeResponse()
     recorder.record(localize_request("s"), response, call, [part], ())

@@ -20,17 +20,19 @@ from mapless_server.engine.groups import (
     PhotoGroup,
     after_rejection,
 )
-from mapless_server.engine.query import TRACK, Query, Result
+from mapless_server.engine.query import TRACK, Query, Result, SceneQuestion
 from mapless_server.errors import RequestError
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.structure.model import MetricScale
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc import Call
+from mapless_server.security import Principal, SceneKey
 from mapless_server.store import SceneAttributes, Store
 
 from .capture.calls import Request, Response
 from .capture.recorder import Recorder
+from .finding import SceneFinder
 from .messages.answers import AnswerFrames, answer_frames_of, diagnostics_to_message, outcome_to_message
 from .messages.debug import debug_to_message
 from .messages.groups import (
@@ -43,7 +45,8 @@ from .messages.groups import (
     with_tracked_motion,
 )
 from .messages.priors import needs_attributes
-from .messages.queries import query_from_message, scene_key_from_name
+from .messages.queries import query_among, query_from_message, scene_key_from_name
+from .messages.scenes import names_several, questions_from_message
 from .watching import Watcher, Watchers
 
 if TYPE_CHECKING:  # services do not load what computes
@@ -74,6 +77,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._engine = engine
         self._metrics = metrics
         self._store = store
+        self._scenes = SceneFinder(store)
         self._watchers = watchers
         self._recorder = recorder
 
@@ -92,10 +96,21 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     async def _query(self, request: pb.LocalizeRequest, call: Call) -> tuple[Query, AnswerFrames]:
         """Converts a request to a query; FieldError or RequestError names the wrong field."""
         options, tenant = self._engine().options, call.principal.tenant
-        frames, attributes = answer_frames_of(request), await self._attributes([request], request.scene, tenant)
+        frames = answer_frames_of(request)
+        if names_several(request):
+            questions, prior_scene = await asyncio.to_thread(self._questions, request, call.principal)
+            call.note(scenes=len(questions))
+            return query_among(request, options, questions, prior_scene), frames
+        attributes = await self._attributes([request], request.scene, tenant)
         query = query_from_message(request, tenant, options, attributes)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
         return query, frames
+
+    def _questions(
+        self, request: pb.LocalizeRequest, principal: Principal
+    ) -> tuple[Sequence[SceneQuestion], SceneKey | None]:
+        """Finds the scenes of a request with several; FieldError or NotFound names the wrong field."""
+        return questions_from_message(request, self._scenes.find(request, principal), principal.tenant)
 
     async def _answer(
         self,
@@ -143,20 +158,22 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._count_attempts([result])
         parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
         call.note(parts_ms=parts_ms, used_references=len(result.references))
+        if query.scenes:
+            call.note(scene=result.scene_key, searched_scenes=result.searched_scene_count)
         if isinstance(answer.outcome, Localization):
             call.note(pose_stage=answer.outcome.pose_stage.value)
         self._report(answer.outcome, response.localization, [result], call, answer.scale)
-        debug = await self._debug_of(request, query, answer)
+        is_watched = result.scene_key in self._watchers.by_scene
+        debug = await self._debug_of(answer, request.options.include_debug or is_watched)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
         self._capture(request, response, call, [(query, result)])
-        if query.scene_key in self._watchers.by_scene and not request.options.confidential:
-            self._watchers.publish(query.scene_key, request, response, debug)
+        if not request.options.confidential:
+            self._watchers.publish(result.scene_key, request, response, debug)
         return response
 
-    async def _debug_of(self, request: pb.LocalizeRequest, query: Query, answer: Answer) -> pb.Debug | None:
-        """The evidence behind the pose, if the caller or a watcher of the scene wants it, and there is any."""
-        is_wanted = request.options.include_debug or query.scene_key in self._watchers.by_scene
+    async def _debug_of(self, answer: Answer, is_wanted: bool) -> pb.Debug | None:
+        """The evidence behind the pose, if the caller or a watcher of its scene wants it, and there is any."""
         if answer.support is None or not is_wanted:
             return None
         return await asyncio.to_thread(debug_to_message, answer.support, answer.scale)

@@ -84,11 +84,21 @@ class Watchers:
         self.by_scene: dict[SceneKey, set[Watcher]] = {}
 
     def publish(
-        self, scene_key: SceneKey, request: pb.LocalizeRequest, response: pb.LocalizeResponse, debug: pb.Debug | None
+        self,
+        scene_key: SceneKey | None,
+        request: pb.LocalizeRequest,
+        response: pb.LocalizeResponse,
+        debug: pb.Debug | None,
     ) -> None:
-        """Sends a copy of an answer to the watchers of its scene; no matches if the computation ended before."""
+        """Sends a copy of an answer to the watchers of its scene; no matches if the computation ended before.
+
+        Nothing in it is of another scene that the photograph was compared with: they may not read that one.
+        """
+        if scene_key not in self.by_scene:
+            return
         answer = pb.LocalizeResponse()
         answer.CopyFrom(response)
+        _remove_other_scenes(answer)
         if debug is not None:
             answer.debug.CopyFrom(debug)
         # A copy, since a field of a message keeps the whole message in memory, with its image.
@@ -96,7 +106,7 @@ class Watchers:
         intrinsics, given = geometry_pb.CameraIntrinsics(), request.HasField("intrinsics")
         intrinsics.CopyFrom(request.intrinsics if given else used.used_intrinsics.intrinsics)
         watched = request.image, intrinsics, answer
-        for watcher in self.by_scene.get(scene_key, ()):
+        for watcher in self.by_scene[scene_key]:
             watcher.put(watched)
 
     def check(self, tenant: str) -> None:
@@ -135,3 +145,13 @@ class Watchers:
         watchers.remove(watcher)
         if not watchers:
             del self.by_scene[scene_key]
+
+
+def _remove_other_scenes(answer: pb.LocalizeResponse) -> None:
+    """Removes what an answer says of other scenes than its own."""
+    answer.diagnostics.ClearField("scenes")
+    hypotheses = answer.rejection.hypotheses
+    if answer.HasField("rejection") and any(it.scene != answer.scene for it in hypotheses):
+        its = [it for it in hypotheses if it.scene == answer.scene]
+        del hypotheses[:]
+        hypotheses.extend(its)

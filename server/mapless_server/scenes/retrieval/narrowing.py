@@ -36,8 +36,8 @@ class Sphere:
         """Distance of a position from the sphere's surface, metres; negative inside."""
         return float(np.linalg.norm(position - self.position)) - self.radius_m
 
-    def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
-        """Mask (N,) of the centres (N, 3) that are outside by at most the margin."""
+    def keeps(self, centres: Array, margin_m: float | Array) -> NDArray[np.bool_]:
+        """Mask (N,) of the centres (N, 3) that are outside by at most the margin, one for all or each its own (N,)."""
         # Not squared: a radius may be any number.
         return np.asarray(np.linalg.norm(centres - self.position, axis=1) <= self.radius_m + margin_m)
 
@@ -49,10 +49,13 @@ class Ellipsoid:
     position: Array
     covariance: Array
 
-    def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
-        """Mask (N,) of the centres (N, 3) in the ellipsoid with each half-axis longer by the margin."""
+    def keeps(self, centres: Array, margin_m: float | Array) -> NDArray[np.bool_]:
+        """Mask (N,) of the centres (N, 3) in the ellipsoid with each half-axis longer by the margin.
+
+        The margin is one for all centres, or each has its own (N,).
+        """
         variances, axes = np.linalg.eigh(self.covariance)
-        half_axes_m = REACH_SIGMA * np.sqrt(variances.clip(min=0)) + margin_m
+        half_axes_m = REACH_SIGMA * np.sqrt(variances.clip(min=0)) + np.asarray(margin_m)[..., None]
         away = (centres - self.position) @ axes / half_axes_m
         return np.asarray(np.einsum("ij,ij->i", away, away) <= 1)
 
@@ -168,6 +171,20 @@ class Narrowing:
             likely &= heading.keeps(axes, self.margin_deg)
         # If no reference is likely, a prior is wrong, which the pose will show; the limits still hold.
         return likely if likely.any() else kept
+
+    def reaches(self, centres: Array, radii_m: Array) -> NDArray[np.bool_]:
+        """Mask (N,) of the spheres that may contain cameras that `keeps` keeps, by their centres (N, 3) and radii (N,).
+
+        All true where no sphere is within the limits; likely values hold among those that are, as far as any is likely.
+        """
+        margins_m = self.margin_m + radii_m
+        kept = np.ones(len(centres), bool)
+        if self.position is not None:
+            kept &= self.position.keeps(centres, margins_m)
+        likely = kept.copy()
+        for position in self.likely_positions:
+            likely &= position.keeps(centres, margins_m)
+        return next((it for it in (likely, kept) if it.any()), np.ones(len(centres), bool))
 
 
 ANYWHERE = Narrowing()

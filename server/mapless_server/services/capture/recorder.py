@@ -19,14 +19,14 @@ from importlib.metadata import PackageNotFoundError, version
 
 from google.protobuf.message import Message
 
-from mapless.names import parse_reference_name, parse_scene_name
+from mapless.names import parse_reference_name
 from mapless_server import __version__
 from mapless_server.engine.query import Query, Result, Tier
 from mapless_server.observability.metrics import Metrics
 from mapless_server.observability.provenance import ROOT, commit_of, cpu_model
 from mapless_server.rpc import Call
 from mapless_server.scenes.observer import BackgroundObserver
-from mapless_server.security import check_tenant
+from mapless_server.security import check_tenant, scene_id_of
 from mapless_server.settings import Settings
 
 from .calls import CapturedCall, CapturedPart, CaptureError, Request, Response, diagnostics_of
@@ -97,8 +97,8 @@ class Recorder:
     ) -> None:
         """Queues an answered call for writing, with its photographs in order and their results.
 
-        Called on the event loop. The response's diagnostics are set to say whether the call is captured. The tiers are
-        all of the server.
+        Called on the event loop. Of several scenes, the call is kept with the one of its answer. The response's
+        diagnostics are set to say whether the call is captured. The tiers are all of the server.
         """
         tenant = call.principal.tenant
         if self._tenants and tenant not in self._tenants:
@@ -109,13 +109,14 @@ class Recorder:
             return
         for diagnostics in diagnostics_of(response):
             diagnostics.captured = True
+        query, result = parts[0]
         captured = CapturedCall(
             call.request_id,
             time.time(),
             type(request).__name__.removesuffix("Request"),
             tenant,
-            parse_scene_name(request.scene),
-            attributes=parts[0][1].attributes,
+            scene_id_of(result.scene_key or query.scene_key),
+            attributes=result.attributes,
             parts=tuple(captured_part(*part) for part in parts),
             request=messages[0].SerializeToString(),
             response=messages[1].SerializeToString(),

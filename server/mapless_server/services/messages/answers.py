@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from mapless import wire
+from mapless import names, wire
 from mapless.axes import Axes, covariance_to, pose_to, world_from_session_in
 from mapless.geodesy import Datum, geopose
 from mapless.geometry import Array, RigidTransform
@@ -19,6 +19,7 @@ from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import ChosenCamera, IntrinsicsSource, LocalizeOptions
 from mapless_server.method.rejection import PoseHypothesis, Rejection
+from mapless_server.security import SceneKey, scene_id_of
 from mapless_server.store import SceneAttributes
 
 from .enums import enum_from_message, enum_to_message, message_of
@@ -54,11 +55,16 @@ def outcome_to_message(
     if isinstance(outcome, Rejection):
         rejection = result_to_rejection(result, options, frames)
         set_used_intrinsics(rejection, used_camera(result, options, photo))
-        return pb.LocalizeResponse(rejection=rejection)
+        return pb.LocalizeResponse(rejection=rejection, scene=scene_to_name(result.scene_key))
     radii = None if outcome.covariance is None else _radii_of(result, options, outcome.covariance)
     localization = _localization_to_message(outcome, radii, result.attributes, frames)
     set_used_intrinsics(localization, used_camera(result, options, photo))
-    return pb.LocalizeResponse(localization=localization)
+    return pb.LocalizeResponse(localization=localization, scene=scene_to_name(result.scene_key))
+
+
+def scene_to_name(scene_key: SceneKey | None) -> str:
+    """Name of the scene of a result; empty if there is none."""
+    return "" if scene_key is None else names.scene_name(scene_id_of(scene_key))
 
 
 def used_camera(result: Result, options: LocalizeOptions, photo: Photo) -> ChosenCamera | None:
@@ -86,9 +92,9 @@ def result_to_rejection(result: Result, options: LocalizeOptions, frames: Answer
     """Message of the rejection that a result is, with the pose that is rejected for its radius alone, if requested."""
     rejection = result.answer.outcome
     assert isinstance(rejection, Rejection)
-    message, pose = rejection_to_message(rejection), rejection.imprecise
+    message, pose = rejection_to_message(rejection, result.scene_key), rejection.imprecise
     if pose is not None and pose.covariance is not None and frames.includes_imprecise:
-        offered, radii = _hypothesis_to_message(pose), _radii_of(result, options, pose.covariance)
+        offered, radii = _hypothesis_to_message(pose, result.scene_key), _radii_of(result, options, pose.covariance)
         offered.arbitrary_unit = result.attributes.arbitrary_unit
         _set_radii(offered, pose.world_from_camera, radii, result.attributes, frames)
         message.hypotheses.append(offered)
@@ -162,19 +168,20 @@ def accuracy_to_message(radii: ReportedRadii) -> pb.Accuracy:
     )
 
 
-def rejection_to_message(rejection: Rejection) -> pb.Rejection:
-    """Message of a rejection, without a pose that is rejected for its radius alone."""
+def rejection_to_message(rejection: Rejection, scene_key: SceneKey | None = None) -> pb.Rejection:
+    """Message of a rejection in a scene, without a pose that is rejected for its radius alone."""
     return pb.Rejection(
         reason=enum_to_message(rejection.reason, pb.RejectionReason),
         message=rejection.message,
         hint=message_of(rejection.hint, pb.Hint) if rejection.hint else None,
-        hypotheses=[_hypothesis_to_message(it) for it in rejection.hypotheses],
+        hypotheses=[_hypothesis_to_message(it, scene_key) for it in rejection.hypotheses],
         intrinsics_checks=[message_of(check, pb.IntrinsicsCheck) for check in rejection.intrinsics_checks],
     )
 
 
-def _hypothesis_to_message(hypothesis: PoseHypothesis) -> pb.Hypothesis:
+def _hypothesis_to_message(hypothesis: PoseHypothesis, scene_key: SceneKey | None) -> pb.Hypothesis:
     return pb.Hypothesis(
+        scene=scene_to_name(SceneKey(hypothesis.world) if hypothesis.world else scene_key),
         world_from_camera=wire.transform_to_message(hypothesis.world_from_camera),
         inlier_count=hypothesis.inlier_count,
         references=hypothesis.references,
@@ -196,7 +203,10 @@ def diagnostics_to_message(result: Result, query: Query) -> pb.Diagnostics:
         server_version=__version__,
         retrieval=result.choice.descriptor if result.choice else "",
         stationary_keypoint_count=answer.stationary_count,
+        searched_scene_count=result.searched_scene_count,
     )
+    for tried in result.scenes:
+        message.scenes.append(message_of(tried, pb.SceneUse, scene=scene_to_name(tried.scene_key)))
     if query.photo.depth is not None:
         message.depth_check.CopyFrom(message_of(answer.depth_check, pb.DepthCheck))
     message.references.extend(_reference_uses(result))

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mapless.geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, GeoPosition, world_from_enu_at, world_from_geodetic
+from mapless.geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, Datum, GeoPosition, world_from_enu_at, world_from_geodetic
 from mapless.geometry import MAX_COORDINATE_M, Array
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
@@ -33,6 +33,8 @@ datum."""
 
 MIN_SIGMA_M, MAX_SIGMA_M = 1e-4, 1e6
 """Range for a position: finer than any survey, wider than any scene."""
+
+SETS_DATUM = "(UpdateScene sets one: mapless scene update --datum)"
 
 MIN_SIGMA_RATIO = 1e-5
 """Least ratio for two directions of a position: rotated to the scene's axes, a smaller one would be lost to rounding.
@@ -58,11 +60,10 @@ def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narr
     """
     limits: dict[str, Any] = {}
     soft: dict[str, Any] = {}
+    check_positions(request)
     if _has(request, "position_prior"):
         limits["position"], soft["position"] = _position(request.position_prior, "position_prior")
     if _has(request, "geo_position_prior"):
-        if _has(request, "position_prior"):
-            raise FieldError("geo_position_prior", "must not be given together with position_prior")
         soft["position"] = _geo_position(request.geo_position_prior, attributes, "geo_position_prior")
     if _has(request, "heading_prior"):
         limits["heading"], soft["heading"] = _heading(request.heading_prior, "heading_prior")
@@ -74,6 +75,12 @@ def priors_from_message(request: Any, attributes: SceneAttributes) -> tuple[Narr
         return ANYWHERE, NO_PRIORS
     priors = Priors(**soft)
     return replace(Narrowing.of(priors), **limits), priors
+
+
+def check_positions(request: Any) -> None:
+    """Raises FieldError for a request with two position priors."""
+    if _has(request, "geo_position_prior") and _has(request, "position_prior"):
+        raise FieldError("geo_position_prior", "must not be given together with position_prior")
 
 
 def _has(request: Any, field: str) -> bool:
@@ -99,22 +106,39 @@ def _geo_position(message: pb.GeoPositionPrior, attributes: SceneAttributes, fie
     """Converts a geographic position to the world; its covariance is given in east, north and up at the position."""
     datum = attributes.datum
     if datum is None:
-        raise FieldError(field, "needs a scene with a datum (UpdateScene sets one: mapless scene update --datum)")
-    _check_within(message.latitude_deg, -90, 90, f"{field}.latitude_deg")
-    _check_within(message.longitude_deg, -180, 180, f"{field}.longitude_deg")
-    _check_within(message.horizontal_sigma_m, MIN_SIGMA_M, MAX_SIGMA_M, f"{field}.horizontal_sigma_m")
+        raise FieldError(field, f"needs a scene with a datum {SETS_DATUM}")
+    _check_geo_position(message, field)
     height_m, vertical_sigma_m = datum.height_m, UNKNOWN_HEIGHT_SIGMA_M
     if message.HasField("height_m"):
-        _check_within(message.height_m, MIN_HEIGHT_M, MAX_HEIGHT_M, f"{field}.height_m")
-        _check_within(message.vertical_sigma_m, MIN_SIGMA_M, MAX_SIGMA_M, f"{field}.vertical_sigma_m")
         height_m, vertical_sigma_m = message.height_m, message.vertical_sigma_m
-    elif message.vertical_sigma_m:
-        raise FieldError(f"{field}.height_m", "is required with vertical_sigma_m")
     place = GeoPosition(message.latitude_deg, message.longitude_deg, height_m)
     rotation = world_from_enu_at(place, datum).rotation
     sigmas_m = np.array([message.horizontal_sigma_m] * 2 + [vertical_sigma_m])
     covariance = rotation @ np.diag(sigmas_m.clip(min=MIN_SIGMA_RATIO * sigmas_m.max()) ** 2) @ rotation.T
     return PositionPrior(world_from_geodetic(place, datum), (covariance + covariance.T) / 2)
+
+
+def _check_geo_position(message: pb.GeoPositionPrior, field: str) -> None:
+    _check_within(message.latitude_deg, -90, 90, f"{field}.latitude_deg")
+    _check_within(message.longitude_deg, -180, 180, f"{field}.longitude_deg")
+    _check_within(message.horizontal_sigma_m, MIN_SIGMA_M, MAX_SIGMA_M, f"{field}.horizontal_sigma_m")
+    if message.HasField("height_m"):
+        _check_within(message.height_m, MIN_HEIGHT_M, MAX_HEIGHT_M, f"{field}.height_m")
+        _check_within(message.vertical_sigma_m, MIN_SIGMA_M, MAX_SIGMA_M, f"{field}.vertical_sigma_m")
+    elif message.vertical_sigma_m:
+        raise FieldError(f"{field}.height_m", "is required with vertical_sigma_m")
+
+
+def narrowing_at_place(message: pb.GeoPositionPrior, field: str) -> tuple[Narrowing, Datum]:
+    """The likely position by a geographic one, in the frame east, north, up at that place, and the frame as a datum.
+
+    Without a height every one is likely, and that of the frame is 0. FieldError if a value is out of range.
+    """
+    _check_geo_position(message, field)
+    vertical_sigma_m = message.vertical_sigma_m if message.HasField("height_m") else MAX_SIGMA_M
+    covariance = np.diag([message.horizontal_sigma_m**2, message.horizontal_sigma_m**2, vertical_sigma_m**2])
+    likely = Narrowing.of(Priors(position=PositionPrior(np.zeros(3), covariance)))
+    return likely, Datum(message.latitude_deg, message.longitude_deg, message.height_m)
 
 
 def _heading(message: pb.HeadingPrior, field: str) -> tuple[Cone | None, HeadingPrior | None]:

@@ -11,11 +11,12 @@ from mapless.lenses import lens_model_of
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, camera_from_message, joined
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query
+from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo, Query, SceneQuestion
 from mapless_server.images import ImageLimits, check_depth, check_mask, image_size
 from mapless_server.images.exif import read_exif
 from mapless_server.method.features.views import seen_share
 from mapless_server.method.options import LocalizeOptions
+from mapless_server.scenes import ANYWHERE
 from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
@@ -126,28 +127,55 @@ MAX_CANDIDATES = 1000
 def query_from_message(
     request: pb.LocalizeRequest, tenant: str, engine: EngineOptions, attributes: SceneAttributes
 ) -> Query:
-    """Converts a request to a query; FieldError or InvalidArgument names the wrong field.
+    """Converts a request that names its scene to a query; FieldError or InvalidArgument names the wrong field.
 
     `attributes` are the scene's; they may be empty unless `needs_attributes` is true.
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
-    check_capture_time(request)
-    most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
+    if request.prior_scene not in ("", request.scene):
+        raise FieldError("prior_scene", f"must be empty or {names.shown(request.scene)}, the request's scene")
     narrowing, priors = priors_from_message(request, attributes)
+    known = attributes if needs_attributes(request) else None
+    most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
+    reference_ids = reference_ids_from_names(request.references, scene_id, most)
+    return _query_in(request, engine, SceneQuestion(key_of(tenant, scene_id), narrowing, priors, known), reference_ids)
+
+
+def query_among(
+    request: pb.LocalizeRequest,
+    engine: EngineOptions,
+    questions: Sequence[SceneQuestion],
+    prior_scene: SceneKey | None,
+) -> Query:
+    """Converts a request to a query among several scenes, at least one; FieldError or InvalidArgument as for one.
+
+    Among one scene it is the query of that scene.
+    """
+    query = _query_in(request, engine, questions[0])
+    if len(questions) == 1:
+        return query
+    several = replace(query, scenes=questions, prior_scene=prior_scene)
+    return several.in_scene(SceneQuestion(query.scene_key, ANYWHERE))
+
+
+def _query_in(
+    request: pb.LocalizeRequest, engine: EngineOptions, question: SceneQuestion, reference_ids: tuple[str, ...] = ()
+) -> Query:
+    check_capture_time(request)
     photo = photo_from_message(request, "", engine.image_limits, needs_intrinsics=False)
     photo = with_depth(photo, request, "", engine.image_limits)
     return Query(
-        scene_key=key_of(tenant, scene_id),
-        reference_ids=reference_ids_from_names(request.references, scene_id, most),
+        scene_key=question.scene_key,
+        reference_ids=reference_ids,
         photo=photo,
-        narrowing=narrowing,
+        narrowing=question.narrowing,
         reference_count=reference_count_from_message(request.options),
         options=uncertain_options(options_from_message(request.options, engine.coverage), request, photo, ""),
         allow_coarse=request.options.allow_coarse,
         rerank=request.options.rerank_references and bool(request.references),
-        priors=priors,
+        priors=question.priors,
         is_generic=request.options.ignore_calibration,
-        attributes=attributes if needs_attributes(request) else None,
+        attributes=question.attributes,
     )
 
 

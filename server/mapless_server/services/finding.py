@@ -1,0 +1,55 @@
+"""Finds the scenes that LocalizeRequests search, and keeps what is made of a group while none of its scenes changes."""
+
+from collections.abc import Mapping
+
+from mapless import names
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.cache import LruCache
+from mapless_server.errors import NotFound
+from mapless_server.security import Principal, scene_id_of
+from mapless_server.store import Store
+
+from .messages.references import labels_from_message
+from .messages.scenes import FoundScenes, scene_keys_from_message
+
+CACHED_SCENES = 100_000
+"""Scenes of all groups together that are kept, some 40 MB; the latest group is, however large."""
+
+
+class SceneFinder:
+    """Finds scenes by name or by label; from any thread."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._groups: LruCache[FoundScenes] = LruCache(CACHED_SCENES, keeps_latest=True)
+
+    def find(self, request: pb.LocalizeRequest, principal: Principal) -> FoundScenes:
+        """The scenes that a request lists, or those of its group.
+
+        FieldError names a wrong field; NotFound has the field scenes[i] of a scene that does not exist, or scene_group
+        if no scene is in it.
+        """
+        if request.scenes:
+            return self._named(request, principal)
+        return self._group(labels_from_message(request.scene_group.labels, "scene_group.labels"), principal)
+
+    def _named(self, request: pb.LocalizeRequest, principal: Principal) -> FoundScenes:
+        keys = scene_keys_from_message(request, principal.tenant)
+        found = self._store.find_scenes_named(keys)
+        if found.missing:
+            missing = found.missing[0]
+            scene_id, field = scene_id_of(missing), f"scenes[{keys.index(missing)}]"
+            raise NotFound(f"there is no scene {scene_id!r}", field=field, resource=names.scene_name(scene_id))
+        return FoundScenes(found.found)
+
+    def _group(self, labels: Mapping[str, str], principal: Principal) -> FoundScenes:
+        scenes = self._store.find_scenes(principal.tenant, labels)
+        if not scenes:
+            having = names.shown(", ".join(f"{name}={value}" for name, value in labels.items()))
+            raise NotFound(f"there is no scene with {having}" if labels else "there is no scene", field="scene_group")
+        name = principal.tenant, frozenset(labels.items())
+        known = self._groups.get(name)
+        if known is None or known.scenes is not scenes:
+            known = FoundScenes(scenes)
+            self._groups.put(name, known, len(scenes))
+        return known

@@ -1,0 +1,224 @@
+"""The scenes among which a LocalizeRequest looks for the photograph's, and what its priors say in each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from mapless import names
+from mapless.geodesy import Datum, ecef_from_geodetic, world_from_other_world
+from mapless.geometry import Array, RigidTransform
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.wire import FieldError
+from mapless_server.engine.query import SceneQuestion
+from mapless_server.errors import DataLoss
+from mapless_server.method.bundle.moved import moved_priors
+from mapless_server.method.bundle.priors import NO_PRIORS, Priors
+from mapless_server.scenes import ANYWHERE, Narrowing
+from mapless_server.security import SceneKey
+from mapless_server.store import GroupedScene, SceneAttributes
+
+from .priors import SETS_DATUM, check_positions, narrowing_at_place, needs_attributes, priors_from_message
+from .queries import scene_key_from_name
+
+MAX_SCENES = 64
+
+UNKNOWN = SceneAttributes()
+
+
+@dataclass(frozen=True, eq=False)
+class FoundScenes:
+    """The scenes that a request may search, in the order in which they were found, and what is made of them once."""
+
+    scenes: Sequence[GroupedScene]
+
+    @cached_property
+    def questions(self) -> tuple[SceneQuestion, ...]:
+        """The questions of a request without priors."""
+        return tuple(SceneQuestion(it.scene_key, ANYWHERE) for it in self.scenes)
+
+    @cached_property
+    def attributes(self) -> tuple[SceneAttributes, ...]:
+        """Their attributes; of a damaged scene, which a search reports, none."""
+        return tuple(map(_attributes_of, self.scenes))
+
+    @cached_property
+    def origins_in_ecef(self) -> Array:
+        """Origins (N, 3) of their worlds on the Earth, metres; NaN without a datum."""
+        datums = [it.datum for it in self.attributes]
+        nowhere = np.full(3, np.nan)
+        return np.array([nowhere if it is None else ecef_from_geodetic(it.origin) for it in datums]).reshape(-1, 3)
+
+
+ReadExtents = Callable[[Sequence[GroupedScene]], Array]
+"""Distances (N,) of the furthest references of scenes from the origins of their worlds, metres; infinite if unknown."""
+
+
+def _attributes_of(scene: GroupedScene) -> SceneAttributes:
+    try:
+        return scene.attributes
+    except DataLoss:
+        return UNKNOWN
+
+
+def names_several(request: pb.LocalizeRequest) -> bool:
+    """Whether a request gives several scenes instead of one; FieldError if it gives both, or none."""
+    is_given = {"scene": request.scene, "scenes": request.scenes, "scene_group": request.HasField("scene_group")}
+    given = [name for name, is_there in is_given.items() if is_there]
+    if len(given) > 1:
+        message = f"must not be given together with {given[0]}: exactly one of {', '.join(is_given)} is required"
+        raise FieldError(given[1], message)
+    if not given:
+        raise FieldError("scene", "must be scenes/{scene}, got ''; or give scenes or scene_group instead")
+    return given != ["scene"]
+
+
+def scene_keys_from_message(request: pb.LocalizeRequest, tenant: str) -> list[SceneKey]:
+    """Keys of the scenes that a request lists; FieldError if there are too many, or a name is wrong or repeated."""
+    if len(request.scenes) > MAX_SCENES:
+        raise FieldError("scenes", f"must be at most {MAX_SCENES}, are {len(request.scenes)}; scene_group has no limit")
+    keys: dict[SceneKey, None] = {}
+    for i, name in enumerate(request.scenes):
+        key = scene_key_from_name(name, f"scenes[{i}]", tenant)
+        if key in keys:
+            raise FieldError(f"scenes[{i}]", f"{names.shown(name)} is repeated")
+        keys[key] = None
+    return list(keys)
+
+
+def questions_from_message(
+    request: pb.LocalizeRequest, found: FoundScenes, tenant: str, extents: ReadExtents | None = None
+) -> tuple[Sequence[SceneQuestion], SceneKey | None]:
+    """The scenes to search, each with the request's priors in its world; and the scene of its pose prior, if any.
+
+    Scenes that are further away than the priors allow are left out, as far as `extents` are known. FieldError names a
+    wrong field.
+    """
+    check_positions(request)
+    if request.references:
+        raise FieldError("references", "must be empty where the server finds the scene: give scene with references")
+    in_world, on_earth = _parts_of(request)
+    prior_index = _prior_scene(request, found, tenant, in_world)
+    if not (in_world.ListFields() or on_earth.ListFields()):
+        return found.questions, None
+    priors = _ScenePriors.of(found, in_world, prior_index, on_earth)
+    questions = [priors.question(i) for i in priors.reached(extents)]
+    if prior_index is None or not request.HasField("pose_prior"):
+        return questions, None
+    return questions, found.scenes[prior_index].scene_key
+
+
+def _parts_of(request: pb.LocalizeRequest) -> tuple[pb.LocalizeRequest, pb.LocalizeRequest]:
+    """The priors that are given in a world, and those that hold in every scene that is placed."""
+    in_world, on_earth = pb.LocalizeRequest(), pb.LocalizeRequest()
+    for name in ("position_prior", "heading_prior", "gravity_prior", "pose_prior", "geo_position_prior"):
+        if request.HasField(name):
+            part = pb.LocalizeRequest()
+            getattr(part, name).CopyFrom(getattr(request, name))
+            (on_earth if needs_attributes(part) else in_world).MergeFrom(part)
+    return in_world, on_earth
+
+
+def _prior_scene(
+    request: pb.LocalizeRequest, found: FoundScenes, tenant: str, in_world: pb.LocalizeRequest
+) -> int | None:
+    """Index of the scene in whose world priors are given; FieldError if it is missing, or none of the scenes."""
+    if not request.prior_scene:
+        if not in_world.ListFields():
+            return None
+        given = in_world.ListFields()[0][0].name
+        raise FieldError("prior_scene", f"is required with {given}: one of several scenes, in whose world it is given")
+    key = scene_key_from_name(request.prior_scene, "prior_scene", tenant)
+    index = next((i for i, it in enumerate(found.scenes) if it.scene_key == key), None)
+    if index is None:
+        given = names.shown(request.prior_scene)
+        raise FieldError("prior_scene", f"must be one of the request's scenes, {given} is not")
+    return index
+
+
+@dataclass(frozen=True, eq=False)
+class _ScenePriors:
+    """The priors of one request in each of several scenes.
+
+    Attributes:
+        found: the scenes.
+        given: limits and priors as they are in the world of one of them.
+        prior_index: index of that scene; None if nothing is given so.
+        on_earth: a geographic position and gravity, which hold in every scene with a datum or a direction of down.
+    """
+
+    found: FoundScenes
+    given: tuple[Narrowing, Priors]
+    prior_index: int | None
+    on_earth: pb.LocalizeRequest
+
+    @staticmethod
+    def of(
+        found: FoundScenes, in_world: pb.LocalizeRequest, prior_index: int | None, on_earth: pb.LocalizeRequest
+    ) -> _ScenePriors:
+        """Reads the priors; FieldError if a value is wrong, or no scene can use one that holds on the Earth."""
+        it = _ScenePriors(found, priors_from_message(in_world, UNKNOWN), prior_index, on_earth)
+        if on_earth.HasField("geo_position_prior") and not np.isfinite(found.origins_in_ecef).any():
+            message = f"needs a scene with a datum, and none of these has one {SETS_DATUM}"
+            raise FieldError("geo_position_prior", message)
+        if on_earth.HasField("gravity_prior") and all(known.down() is None for known in found.attributes):
+            raise FieldError("gravity_prior.down_in_world", "is required: no scene has a datum or a direction of down")
+        return it
+
+    def question(self, index: int) -> SceneQuestion:
+        """The question of one scene."""
+        scene, known = self.found.scenes[index], self.found.attributes[index]
+        narrowing, priors = self._given_in(index)
+        is_converted = index != self.prior_index and (bool(priors) or not narrowing.is_empty)
+        on_earth = pb.LocalizeRequest()
+        on_earth.CopyFrom(self.on_earth)
+        if known.datum is None:
+            on_earth.ClearField("geo_position_prior")
+        if known.down() is None:
+            on_earth.ClearField("gravity_prior")
+        _, added = priors_from_message(on_earth, known)
+        if added:
+            gravity = added.gravity or priors.gravity
+            priors = replace(priors, position=added.position or priors.position, gravity=gravity)
+            narrowing = replace(Narrowing.of(priors), position=narrowing.position, heading=narrowing.heading)
+        return SceneQuestion(scene.scene_key, narrowing, priors, known if is_converted or added else None)
+
+    def _given_in(self, index: int) -> tuple[Narrowing, Priors]:
+        """What is given in one scene's world, in that of another; nothing if one of them has no datum."""
+        if index == self.prior_index:
+            return self.given
+        datum, other = self.found.attributes[index].datum, self._prior_datum
+        if datum is None or other is None:
+            return ANYWHERE, NO_PRIORS
+        return _moved(*self.given, world_from_other_world(datum, other))
+
+    @property
+    def _prior_datum(self) -> Datum | None:
+        return None if self.prior_index is None else self.found.attributes[self.prior_index].datum
+
+    def reached(self, extents: ReadExtents | None) -> Sequence[int]:
+        """Indices of the scenes that may have references where the priors allow or expect the camera."""
+        places = [] if self._prior_datum is None else [(self.given[0], self._prior_datum)]
+        if self.on_earth.HasField("geo_position_prior"):
+            places.append(narrowing_at_place(self.on_earth.geo_position_prior, "geo_position_prior"))
+        count = len(self.found.scenes)
+        if extents is None or not places:
+            return range(count)
+        placed = np.flatnonzero(np.isfinite(self.found.origins_in_ecef[:, 0]))
+        origins, radii_m = self.found.origins_in_ecef[placed], extents(self.found.scenes)[placed]
+        kept = np.ones(len(placed), bool)
+        for narrowing, datum in places:
+            kept &= narrowing.reaches(datum.ecef_from_world().inverse().apply(origins), radii_m)
+        beyond = placed[~kept] if kept.any() else placed[:0]
+        return np.delete(np.arange(count), beyond).tolist()
+
+
+def _moved(narrowing: Narrowing, priors: Priors, other_from_world: RigidTransform) -> tuple[Narrowing, Priors]:
+    """Limits and priors in another world, in which theirs has a pose."""
+    priors, sphere, cone = moved_priors(priors, other_from_world), narrowing.position, narrowing.heading
+    position = sphere and replace(sphere, position=other_from_world.apply(sphere.position))
+    heading = cone and replace(cone, forward=other_from_world.rotation @ cone.forward)
+    return replace(Narrowing.of(priors), position=position, heading=heading), priors
