@@ -19,7 +19,8 @@ import typer.cli
 from google.protobuf import descriptor_pb2
 
 from mapless import errors as client_errors
-from mapless.cli.arguments import all_parsers, make_parser
+from mapless.cli.arguments import make_parser
+from mapless.cli.parsing import all_parsers
 from mapless_server import errors, settings
 from mapless_server.method.ladder import RUNGS
 from mapless_server.observability.metrics import Metrics

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TextIO
 
-from .cli.arguments import connect_options, make_parser
+from .cli.arguments import make_parser
 from .cli.folder import EXIT_FAILED, EXIT_USAGE
 from .cli.output import suggesting
+from .cli.parsing import connect_options
 from .cli.waiting import WaitingClient
 from .errors import MaplessError
 
