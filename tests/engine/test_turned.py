@@ -22,14 +22,14 @@ from mapless_server.engine import choosing
 from mapless_server.engine.options import EngineOptions
 from mapless_server.engine.photo_views import QueryViews
 from mapless_server.engine.query import MIRROR, Caller, Photo, Query, Result, Tier
-from mapless_server.engine.search import Material, Search
+from mapless_server.engine.search import Search
 from mapless_server.images import ImageLimits, decode_image, upright_of
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.bundle.priors import NO_PRIORS, GravityPrior, Priors
 from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.features.extractors.turned import extract_turned
 from mapless_server.method.features.rolls import Similarity
-from mapless_server.method.features.views import Ignored, View, view_of
+from mapless_server.method.features.views import Ignored, PosedView, View, view_of
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.judge.hypothesis import AS_IT_IS
 from mapless_server.method.options import DoubtOptions, LocalizeOptions
@@ -214,8 +214,8 @@ def test_agreement_is_that_of_the_references_a_pose_needs(
 ) -> None:
     found = [Similarity(0.0, it, 100) for it in agreeing]
     references = [SimpleNamespace(depths=object() if has_depths else None) for _ in agreeing]
-    material = cast(Material, SimpleNamespace(references=references))
-    assert choosing.agreement_of(found, material, is_part) == pytest.approx(expected)
+    posed = cast(Sequence[PosedView], references)
+    assert choosing.agreement_of(found, posed, is_part) == pytest.approx(expected)
 
 
 def test_an_upright_photograph_is_not_tried_turned(localize: Localize) -> None:

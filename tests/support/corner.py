@@ -32,15 +32,19 @@ def wallpaper(seed: int) -> NDArray[np.uint8]:
     return np.asarray(cv2.GaussianBlur(paper, (0, 0), 0.8), np.uint8)
 
 
-_PAPERS = tuple(wallpaper(seed) for seed in range(3))
+PAPERS = tuple(wallpaper(seed) for seed in range(3))
 
 
-def photograph(world_from_camera: RigidTransform, camera: Camera = CAMERA) -> bytes:
-    """A PNG of what a camera in the room sees."""
-    return encode(".png", picture(world_from_camera, camera))
+def photograph(
+    world_from_camera: RigidTransform, camera: Camera = CAMERA, papers: Sequence[NDArray[np.uint8]] = PAPERS
+) -> bytes:
+    """A PNG of what a camera in the room sees, whose walls have these papers."""
+    return encode(".png", picture(world_from_camera, camera, papers))
 
 
-def picture(world_from_camera: RigidTransform, camera: Camera = CAMERA) -> NDArray[np.uint8]:
+def picture(
+    world_from_camera: RigidTransform, camera: Camera = CAMERA, papers: Sequence[NDArray[np.uint8]] = PAPERS
+) -> NDArray[np.uint8]:
     """The same as (H, W, 3)."""
     columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
     rays = camera.rays(np.stack([columns, rows], axis=-1)) @ world_from_camera.rotation.T
@@ -50,7 +54,7 @@ def picture(world_from_camera: RigidTransform, camera: Camera = CAMERA) -> NDArr
     wall = depths.argmin(axis=-1)
     hit = centre + rays * depths.min(axis=-1, keepdims=True)
     shown = np.zeros((camera.height_px, camera.width_px, 3), np.uint8)
-    for axis, paper in enumerate(_PAPERS):
+    for axis, paper in enumerate(papers):
         across, down = np.moveaxis(np.delete(hit, axis, axis=-1) * -_TEXELS_PER_M, -1, 0).astype(np.float32)
         found = cv2.remap(paper, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         shown[wall == axis] = found[wall == axis]

@@ -71,7 +71,7 @@ def described_anew(search: Search, tier: Tier, any_roll: int | None) -> Material
 
     `any_roll` is the index of the features that match however the camera is rolled.
     """
-    attempt, verdict, query = search.attempt, search.verdict, search.query
+    attempt, verdict, query = search.attempt, search.own, search.query
     if attempt.where is Where.ONE_PLACE and verdict is not None and verdict.place is not None:
         return search.materials[search.found.index(verdict.chosen)].of_place(verdict.place, attempt.basis)
     if attempt.where is Where.ANYWHERE and _is_same_anywhere(search, tier):
@@ -157,20 +157,20 @@ def compared(search: Search) -> Search:
     pairs = zip(material.references, material.query_matches, strict=True)
     found = [similarity_of(material.view, reference.view, matches) for reference, matches in pairs]
     is_enough = search.query.is_part or search.query.photo.depth is not None
-    agreement = max(search.agreement, agreement_of(found, material, is_enough))
+    agreement = max(search.agreement, agreement_of(found, material.references, is_enough))
     search = search.but(agreement=agreement)
     is_upright = search.attempt.raster is Raster.AS_IS
     return search.but(angles_deg=_rasters_by(search, material, found)) if is_upright else search
 
 
-def agreement_of(found: Sequence[Similarity | None], material: Material, is_enough: bool) -> float:
+def agreement_of(found: Sequence[Similarity | None], references: Sequence[PosedView], is_enough: bool) -> float:
     """The agreement that as many references reach as a pose needs: two.
 
     One that has depths is enough, and so is one for a rig's or sequence's photograph, which others help; chance reaches
     more with one of many than with two.
     """
     agreements = [it.agreement if it else 0.0 for it in found]
-    alone = [a for a, it in zip(agreements, material.references, strict=True) if is_enough or it.depths is not None]
+    alone = [a for a, it in zip(agreements, references, strict=True) if is_enough or it.depths is not None]
     _, second, *_ = sorted([*agreements, 0.0, 0.0], reverse=True)
     return max([second, *(it - ALONE_BY_CHANCE for it in alone)])
 

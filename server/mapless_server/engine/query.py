@@ -215,6 +215,12 @@ class Query:
         it = question
         return replace(self, scene_key=it.scene_key, narrowing=it.narrowing, priors=it.priors, attributes=it.attributes)
 
+    def in_prior_scene(self) -> tuple[Query, bool]:
+        """The query in the scene of its prior, or in any one of its scenes; and whether it can be tracked there."""
+        named = next((it for it in self.scenes if it.scene_key == self.prior_scene), None)
+        query = self.in_scene(named or self.scenes[0])
+        return query, named is not None and query.can_be_tracked
+
     @property
     def chooses(self) -> bool:
         """Whether the server chooses the references, by their similarity to the photograph."""

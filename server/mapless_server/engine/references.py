@@ -1,29 +1,32 @@
 """The references of all scenes, for the stages of a query, and for what callers ask of references."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mapless_server.engine.photo_views import QueryViews, RasterForm
-from mapless_server.engine.query import Description, Photo
-from mapless_server.errors import DataLoss, InvalidArgument
+from mapless_server.engine.query import Description, Photo, SceneQuestion
+from mapless_server.errors import DataLoss, InvalidArgument, NotFound
 from mapless_server.images import ImageLimits, decode_depth
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.options import StageContext
 from mapless_server.method.structure.measured_depth import median_depth
-from mapless_server.scenes import Choice, Selection, rank_references
+from mapless_server.scenes import Choice, RankedReference, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.later import Pending
 from mapless_server.scenes.library import FeaturesMissing
 from mapless_server.scenes.retrieval.index import Entries, GlobalDescriptor
-from mapless_server.scenes.retrieval.ranking import nearest_references
+from mapless_server.scenes.retrieval.ranking import nearest_references, rank_among
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey
 from mapless_server.store.queries import reference_not_found
 
 from .query import POSE_PRIOR
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +109,35 @@ class References:
             vector = own.descriptor.describe(view)
             ranked = rank_references(entries, vector, selection)
         return Choice(tuple(ranked), own.descriptor.name, entries.generation)
+
+    def choose_among(
+        self, questions: Sequence[SceneQuestion], views: QueryViews, count: int, context: StageContext
+    ) -> Sequence[tuple[SceneQuestion, Sequence[RankedReference]]]:
+        """Chooses so many references for a photograph, the most similar of those of several scenes, as over one index.
+
+        Within a scene they are chosen as by `choose`; those of two scenes are never near one another.
+
+        Returns:
+            The scenes that exist and can be read, in order, and the references of each, the most similar first.
+        """
+        main = self.retrievals[0]
+        with context.stage("retrieval"):
+            read = [it for question in questions if (it := self._entries_of(question, context)) is not None]
+        if not any(len(entries) for _, entries in read):
+            return [(question, ()) for question, _ in read]
+        view = views.view(main.extractor, context)
+        with context.stage("retrieval"):
+            vector = main.descriptor.describe(view)
+            found = rank_among([(entries, question.narrowing) for question, entries in read], vector, count)
+        return [(question, some) for (question, _), some in zip(read, found, strict=True)]
+
+    def _entries_of(self, question: SceneQuestion, context: StageContext) -> tuple[SceneQuestion, Entries] | None:
+        """The references of one of several scenes; None, and a line in the log, if it cannot be read."""
+        try:
+            return question, self.retrievals[0].indexes.entries(question.scene_key, context)
+        except (NotFound, DataLoss) as error:
+            log.warning("scene %s is left out among several: %s", question.scene_key, error)
+            return None
 
     def _described(
         self, scene_key: SceneKey, views: QueryViews, selection: Selection, context: StageContext, own: Retrieval

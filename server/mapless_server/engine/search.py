@@ -22,6 +22,7 @@ from mapless_server.scheduling import Job, StageResult, Step, processor_s
 from mapless_server.store import SceneAttributes, SceneState
 
 from .query import PREPARE, REFINE, CutReason, LadderCut, MissingEvidence, Query, Result, Tried
+from .scene_group import SceneGroup, begun_scenes
 from .source import ReferenceSource
 
 if TYPE_CHECKING:  # services need not load what computes
@@ -130,6 +131,9 @@ class Search:
         cuts: attempts that were left out, or not finished, for another reason than what the photograph shows.
         is_cut_at: whether the caller gets cheap rungs only, though one follows that is not, of a name and features.
         verdict: what is answered by now; None before the first result.
+        own: of several scenes, the verdict of the present one's attempts alone; else the same.
+        group: the scenes, if the query is of several.
+        parked: the searches in others of these, by their ranks, and the time of their stages.
         begun_s: when the query came, by `time.monotonic`.
         start_s: when the attempt began to wait for the queue, by `time.monotonic`.
         give_up_s: time after which the verdict so far is the answer, if the attempt has no result by then.
@@ -162,6 +166,9 @@ class Search:
     cuts: tuple[LadderCut, ...] = ()
     is_cut_at: Callable[[str, str], bool] = lambda rung, features: False
     verdict: Verdict | None = None
+    own: Verdict | None = None
+    group: SceneGroup | None = None
+    parked: Mapping[int, tuple[Search, Mapping[str, float]]] = field(default_factory=dict)
     begun_s: float = field(default_factory=time.monotonic)
     start_s: float = field(default_factory=time.monotonic)
     give_up_s: float = math.inf
@@ -189,8 +196,12 @@ class Search:
         on_better: Callable[[Result], object] | None = None,
     ) -> Search:
         """The search at its first attempt."""
-        rung, attempt = first_attempt(query.can_be_tracked)
-        return cls(query, source, views, deadline_s, on_better, rung, attempt)
+        group, can_be_tracked = None, query.can_be_tracked
+        if query.scenes:
+            group = SceneGroup(query, views)
+            query, can_be_tracked = query.in_prior_scene()
+        rung, attempt = first_attempt(can_be_tracked)
+        return cls(query, source, views, deadline_s, on_better, rung, attempt, group=group)
 
     def but(self, **changes: object) -> Search:
         """A copy with these values: `dataclasses.replace` in a tenth of its time, a dozen times a query.
@@ -238,6 +249,8 @@ class Search:
 
     def to(self, rung: str, attempt: Attempt, give_up_s: float, features: str) -> Search:
         """The search at another attempt; `features` are those of the one before."""
+        if attempt.scene != self.attempt.scene:
+            return self.in_scene(attempt.scene, features).to(rung, attempt, give_up_s, features)
         is_other = attempt.basis != self.attempt.basis or self.coarse is None
         return self.but(
             rung=rung,
@@ -250,8 +263,54 @@ class Search:
             stage_processor_s=None,
             listings=1,
             context=self._next_context() if is_other else self.context,
-            spent_s=self.seconds(features) if is_other else self.spent_s,
+            spent_s=self._own_seconds(features) if is_other else self.spent_s,
         )
+
+    def in_scene(self, rank: int, features: str) -> Search:
+        """The search in one of several scenes, where it was left or at its begin; this one is parked.
+
+        It is the one that it would be with the scene named: it has its own attempts, and so its own doubts. `features`
+        are those of the present attempt.
+        """
+        if rank == self.attempt.scene:
+            return self
+        parked = {**self.parked, self.attempt.scene: (self, self._own_seconds(features))}
+        there = parked.pop(rank)[0] if rank in parked else self.entered(rank)
+        return there.but(
+            group=self.group,
+            parked=parked,
+            tried=self.tried,
+            attempts=self.attempts,
+            cuts=self.cuts,
+            verdict=self.verdict,
+        )
+
+    def entered(self, rank: int) -> Search:
+        """The search at its begin in one of several scenes."""
+        assert self.group is not None
+        return self.but(
+            query=self.group.query.in_scene(self.group.ranking[rank].question),
+            views=self.group.views,
+            attempt=Attempt(scene=rank),
+            before=None,
+            found=(),
+            materials=(),
+            own=None,
+            pending=None,
+            context=StageContext(self.context.check),
+            spent_s={},
+            material=None,
+            prepared=None,
+            coarse=None,
+            angles_deg=(),
+            agreement=0.0,
+        )
+
+    @property
+    def searches(self) -> list[Search]:
+        """The searches in all scenes that were tried, in the order of their ranks."""
+        there = {rank: it for rank, (it, _) in self.parked.items()} | {self.attempt.scene: self}
+        return [it for _, it in sorted(there.items())]
 
     def _next_context(self) -> StageContext:
         """The context of an attempt with other photographs or references.
@@ -303,6 +362,14 @@ class Search:
 
     def seconds(self, features: str) -> dict[str, float]:
         """Time of every stage so far; those of the present photographs after the first ones begin with `features`."""
+        seconds = self._own_seconds(features)
+        for _, parked in self.parked.values():
+            for name, spent_s in parked.items():
+                seconds[name] = seconds.get(name, 0.0) + spent_s
+        return seconds
+
+    def _own_seconds(self, features: str) -> dict[str, float]:
+        """The same of the present one of several scenes."""
         is_first = not any(it.basis != self.attempt.basis for it in self.tried if it.where is not Where.NEAR_PRIOR)
         seconds = dict(self.spent_s)
         for name, spent_s in dict(self.context.stage_seconds).items():  # which a stage may change meanwhile
@@ -316,7 +383,8 @@ class Search:
 
     def paused(self, stage: Search) -> Search:
         """The search after a stage of its attempt, or of another one, whose time is then not its own."""
-        if stage.stage_start_s is None or stage.stage_processor_s is None or stage.rung != self.rung:
+        is_other = (stage.rung, stage.attempt.scene) != (self.rung, self.attempt.scene)
+        if stage.stage_start_s is None or stage.stage_processor_s is None or is_other:
             return self.but(stage_start_s=None, stage_processor_s=None)
         return self.but(
             computed_s=stage.computed_s + time.monotonic() - stage.stage_start_s,
@@ -330,7 +398,20 @@ class Search:
         """Kind of its jobs; jobs of one kind take about the same time."""
         count = len(self.query.reference_ids)
         size = next((it for it in _COUNTS if count <= it), _COUNTS[-1])
-        return f"{self.rung}, tier {self.attempt.features}, {'chosen' if self.query.chooses else f'up to {size}'}"
+        kind = f"{self.rung}, tier {self.attempt.features}, {'chosen' if self.query.chooses else f'up to {size}'}"
+        return f"{kind}, among scenes" if self.chooses_scenes else kind
+
+    @property
+    def chooses_scenes(self) -> bool:
+        """Whether the scenes are still to be chosen in which the photograph is looked for."""
+        return self.group is not None and not self.group.ranking and self.attempt.where is not Where.NEAR_PRIOR
+
+    @property
+    def is_at_begin(self) -> bool:
+        """Whether nothing was tried, or nothing in the present one of several scenes."""
+        if self.group is None or self.attempt.where is Where.NEAR_PRIOR:
+            return not self.tried
+        return self.attempt.scene not in begun_scenes(self.tried)
 
     @property
     def first_step(self) -> Step[Search]:

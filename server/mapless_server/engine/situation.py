@@ -19,7 +19,7 @@ def any_roll_of(tiers: Sequence[Tier]) -> int | None:
 
 def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions) -> Situation:
     """On which the rungs after the present attempt depend."""
-    query, material, verdict = search.query, search.material, search.verdict
+    query, material, verdict = search.query, search.material, search.own
     place = None if verdict is None else verdict.place
     return Situation(
         is_best=query.options.variant is Variant.BEST,
@@ -30,13 +30,14 @@ def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions)
         any_roll=any_roll_of(tiers),
         angles_deg=search.angles_deg,
         has_depth=search.coarse is not None and search.coarse.prepared.has_depth,
+        other_scene=None if search.group is None else search.group.next_scene(search.tried),
         known=_known(search),
         promise=promise,
     )
 
 
 def _known(search: Search) -> Known:
-    verdict = search.verdict
+    verdict = search.own
     if verdict is None:
         return UNKNOWN
     is_accepted = not isinstance(verdict.outcome, Rejection)

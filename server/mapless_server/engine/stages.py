@@ -46,7 +46,7 @@ from mapless_server.scheduling import (
     processor_s,
 )
 
-from . import cameras, choosing, cutting, tracking
+from . import among, cameras, choosing, cutting, tracking
 from .failures import failure_of
 from .query import COARSE, PREPARE, REFINE, TRACK, CutReason, LadderCut, Result, Tier
 from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
@@ -148,6 +148,12 @@ class QueryStages:
         if is_outdated and search.listings < MAX_LISTINGS:
             again = search.but(listings=search.listings + 1, material=None, coarse=None)
             return self._next(again, again.first_step)
+        if search.group is not None and not search.chooses_scenes and among.is_of_scene(failure):
+            without = among.without_scene(search, failure)
+            if without is None:
+                return failure
+            cut = without.cut(search.rung, self._verdicts.tier(search.attempt).features, CutReason.FAILED)
+            return self._skipped(cut, CutReason.FAILED.value)
         if search.verdict is not None:
             return self._without_attempt(search, failure)
         if not is_outdated:
@@ -186,7 +192,10 @@ class QueryStages:
     def _described(self, search: Search) -> Search | SearchResult:
         """The search with what its attempt is computed from; or what follows if there is nothing to compute."""
         attempt = search.attempt
-        if not search.tried:
+        if search.chooses_scenes:
+            search = among.with_scenes(search, self._verdicts.tier(attempt))
+            return self._next(search, search.first_step)
+        if search.is_at_begin:
             search = choosing.turned_by_gravity(search, self._verdicts.tier(attempt))
         if attempt.where is Where.NEAR_PRIOR:
             return self._tracked(search)
@@ -375,6 +384,7 @@ class QueryStages:
         if search.may_be_elsewhere and choosing.resembles_elsewhere(search, found, self._verdicts.tier(search.attempt)):
             found = replace(found, doubts=found.doubts | Doubt.LIKE_ELSEWHERE)
         search = choosing.compared(search) if found.doubts else search
+        found = found if search.group is None else among.doubting(search, found)
         outcome, material = found.answer.outcome, search.material or search.materials[-1]
         ended = "localized" if isinstance(outcome, Localization) else outcome.reason.value
         before = search.verdict
@@ -383,10 +393,13 @@ class QueryStages:
             materials=(*search.materials, material),
         )
         verdict = decide(search.found, search.query.priors, search.attributes.unit)
-        search = search.but(verdict=verdict)
+        search = search.but(own=verdict, verdict=verdict)
+        if search.group is not None:
+            search = search.but(verdict=among.verdict_among(search))
         following = self._climb(search)
-        is_better = before is None or verdict.outcome is not before.outcome
-        is_sent = is_better and isinstance(verdict.outcome, Localization) and isinstance(following, Next)
+        assert search.verdict is not None
+        is_better = before is None or search.verdict.outcome is not before.outcome
+        is_sent = is_better and isinstance(search.verdict.outcome, Localization) and isinstance(following, Next)
         if is_sent and search.on_better is not None:
             search.on_better(self._verdicts.answer(search))
         return following
@@ -394,7 +407,8 @@ class QueryStages:
     def _climb(self, search: Search) -> SearchResult:
         verdict = search.verdict
         if verdict is None:  # near the prior there was none
-            first = search.to(AS_IT_IS, Attempt(), search.give_up_s, self._tiers[0].features)
+            rank = search.group.next_scene(search.tried) if search.group is not None else None
+            first = search.to(AS_IT_IS, Attempt(scene=rank or 0), search.give_up_s, self._tiers[0].features)
             return self._next(first, first.first_step)
         if not verdict.doubts:
             return self._done(search)
@@ -404,8 +418,11 @@ class QueryStages:
         now_s = time.monotonic()
         give_up_s = min(now_s + TIME_SHARE * (search.deadline_s - now_s), search.ends_s)
         search = search.but(give_up_s=give_up_s)
-        situation, doubts = situation_of(search, self._tiers, self._doubt.promise), verdict.doubts
-        following = ladder.further(before, search.tried, doubts, situation)
+        if search.group is None:
+            situation = situation_of(search, self._tiers, self._doubt.promise)
+            following = ladder.further(before, search.tried, verdict.doubts, situation)
+        else:
+            following = among.following(search, self._tiers, self._doubt.promise)
         search, rungs = cutting.offered(search, following, lambda it: self._verdicts.tier(it).features)
         steps = [chosen.to(rung.name, it, give_up_s, features).first_step for chosen, rung, it in rungs]
         return self._next(steps[0].payload, *steps) if steps else self._done(search)

@@ -76,6 +76,7 @@ class Verdicts:
         verdict = search.verdict
         assert verdict is not None
         chosen = verdict.chosen
+        search = search.in_scene(chosen.attempt.scene, self.tier(search.attempt).features)
         if search.query.is_part and chosen.answer.support is None:  # its group needs what matches there are
             chosen = next((it for it in reversed(search.found) if it.answer.support is not None), chosen)
         material = search.materials[search.found.index(chosen)]
@@ -105,6 +106,7 @@ class Verdicts:
             answer = hinted(answer, material.view, material.references, has_prior, compares)
             assert isinstance(answer.outcome, Rejection)
             answer = replace(answer, outcome=with_contradiction(answer.outcome, contradiction))
+        group = search.group
         return Result(
             answer,
             self.tier(found.attempt),
@@ -116,7 +118,9 @@ class Verdicts:
             material.attributes,
             search.seconds(self.tier(search.attempt).features),
             camera=material.camera,
-            scene_key=search.query.scene_key,
+            scene_key=search.query.scene_key if group is None or material.is_searched else None,
+            scenes=() if group is None else group.tried_scenes(search.tried),
+            searched_scene_count=1 if group is None else group.searched_count,
         )
 
 

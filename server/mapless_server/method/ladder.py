@@ -26,6 +26,7 @@ class Situation:
         angles_deg: by how much to turn the photograph, clockwise, so that references are upright in one of its rasters;
             empty if they are in the photograph as it is, or if that is unknown.
         has_depth: whether the photograph, or one of the references, has depth.
+        other_scene: of several scenes, the rank of the next one whose references match the photograph; None if none.
         known, promise: what is known of the photograph, and when an attempt is worth its time by that.
     """
 
@@ -37,6 +38,7 @@ class Situation:
     any_roll: int | None = None
     angles_deg: tuple[float, ...] = ()
     has_depth: bool = False
+    other_scene: int | None = None
     known: Known = UNKNOWN
     promise: PromiseOptions = PROMISE
 
@@ -81,8 +83,8 @@ def _with_features(features: int, before: Attempt, situation: Situation) -> Atte
     # A raster of stronger features costs as much as all attempts before, so there is one: that of most matches.
     angles_deg = situation.angles_deg if features == 0 else situation.angles_deg[:1]
     if features == situation.any_roll or angles_deg in ((), (0.0,)):
-        return Attempt(features, where=where)
-    return Attempt(features, Raster.TURNED, angles_deg, where)
+        return Attempt(features, where=where, scene=before.scene)
+    return Attempt(features, Raster.TURNED, angles_deg, where, scene=before.scene)
 
 
 def _next_stronger(before: Attempt, situation: Situation) -> int:
@@ -173,6 +175,23 @@ RUNGS = (
         is_cheap=True,
     ),
     Rung(
+        "other scene",
+        "references of the scene that matches second best",
+        Doubt.STARVED
+        | Doubt.CHANCE
+        | Doubt.TWO_PLACES
+        | Doubt.BEYOND_LIMITS
+        | Doubt.REFERENCES
+        | Doubt.CAMERA
+        | Doubt.OTHER_SCENE,
+        "several scenes; matches with references of another one",
+        "matches with other references, structure and pose",
+        "in another scene",
+        lambda before, it: Attempt(scene=it.other_scene or 0),
+        lambda before, it: it.other_scene is not None,
+        is_cheap=True,
+    ),
+    Rung(
         "turned",
         "features of the photograph turned until it is upright in the references",
         Doubt.STARVED | Doubt.CHANCE,
@@ -223,7 +242,7 @@ def further(
         situation: on which rungs are possible.
     """
     if Doubt.CAMERA in doubts:
-        return
+        doubts = Doubt.CAMERA
     for rung in RUNGS:
         if not (rung.doubts & doubts and rung.is_possible(before, situation)):
             continue

@@ -95,7 +95,7 @@ def hypothesis(answer: Answer, attempt: Attempt = FIRST) -> Hypothesis:
 @pytest.fixture(autouse=True)
 def _inliers_are_the_scores(monkeypatch: pytest.MonkeyPatch) -> None:
     """The planted poses have no matches with references, by which they would be scored."""
-    monkeypatch.setattr(module, "_matches", lambda _: [])
+    monkeypatch.setattr(module, "matches_of", lambda _: [])
 
 
 class TestDoubt:

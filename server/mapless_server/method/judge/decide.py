@@ -77,7 +77,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, eq=False)
-class _Place:
+class Place:
     """Poses that are near one another, the best score first."""
 
     poses: Sequence[Hypothesis]
@@ -85,9 +85,11 @@ class _Place:
 
     @property
     def accepted(self) -> Sequence[Hypothesis]:
+        """Those that were accepted."""
         return [it for it in self.poses if it.is_accepted]
 
     def as_hypothesis(self) -> PoseHypothesis:
+        """Its best pose, an accepted one if there is one, and the references that support it."""
         best = next(iter(self.accepted), self.poses[0])
         support = best.answer.support
         counts = [] if support is None else list(zip(support.references, support.inliers_by_reference(), strict=True))
@@ -110,10 +112,11 @@ def decide(found: Sequence[Found], priors: Priors, unit: str = "m", options: Pla
     within = [it for it in found if isinstance(it, Hypothesis) and Doubt.BEYOND_LIMITS not in it.doubts]
     if not any(it.is_accepted for it in within):
         return _rejected(found, within, priors, options)
-    rivals = _rivals(_places_of(within, found, options), priors, options)
+    rivals = _rivals(places_of(within, found, options), priors, options)
     if len(rivals) == 1:
         return _at(rivals[0])
-    decided = place_of_priors([it.as_hypothesis() for it in rivals], [it.score for it in rivals], priors, options)
+    places, scores = [it.as_hypothesis() for it in rivals], [it.score for it in rivals]
+    decided = place_of_priors(places, scores, [priors] * len(rivals), options)
     return _at(rivals[decided]) if isinstance(decided, int) else _ambiguous(rivals, decided, unit)
 
 
@@ -128,18 +131,19 @@ def at_one_place(first: Hypothesis, second: Hypothesis, options: PlaceOptions = 
 
 
 def place_of_priors(
-    places: Sequence[PoseHypothesis], scores: Sequence[float], priors: Priors, options: PlaceOptions = PLACES
+    places: Sequence[PoseHypothesis], scores: Sequence[float], priors: Sequence[Priors], options: PlaceOptions = PLACES
 ) -> int | Hint | None:
     """Index of the only place that the priors do not exclude, or a hint why they do not decide; None without priors.
 
-    They decide if all of them agree with one place and exclude the others, unless another has clearly more.
+    They decide if all of them agree with one place and exclude the others, unless another has clearly more. The priors
+    are those in each place's world.
     """
-    if not priors:
+    if not any(priors):
         return None
     # Hypotheses are not refined. Their assumed error is such that two of one place still agree at two sigma.
     sigmas = [options.same_position_m / 2] * 3 + [math.radians(options.same_rotation_deg) / 2] * 3
     covariance = np.diag(np.square(sigmas))
-    checks = [priors.check(it.world_from_camera, covariance) for it in places]
+    checks = [of_one.check(it.world_from_camera, covariance) for it, of_one in zip(places, priors, strict=True)]
     left = [i for i, of_one in enumerate(checks) if not any(it.conflict for it in of_one)]
     best = next(iter(places[0].references), None)
     if not left:
@@ -158,7 +162,7 @@ def place_of_priors(
     return left[0]
 
 
-def _places_of(hypotheses: Sequence[Hypothesis], found: Sequence[Found], options: PlaceOptions) -> list[_Place]:
+def places_of(hypotheses: Sequence[Hypothesis], found: Sequence[Found], options: PlaceOptions) -> list[Place]:
     """The places of the poses, the best score first."""
     scores = _scores(hypotheses, found)
     order = sorted(range(len(hypotheses)), key=lambda i: (-scores[i], -hypotheses[i].attempt.features))
@@ -170,10 +174,10 @@ def _places_of(hypotheses: Sequence[Hypothesis], found: Sequence[Found], options
             places.append((scores[i], [pose]))
         else:
             near.append(pose)
-    return [_Place(poses, score) for score, poses in places]
+    return [Place(poses, score) for score, poses in places]
 
 
-def _rivals(places: Sequence[_Place], priors: Priors, options: PlaceOptions) -> list[_Place]:
+def _rivals(places: Sequence[Place], priors: Priors, options: PlaceOptions) -> list[Place]:
     """The places between which scores do not decide, the best first.
 
     A place that contradicts the priors is never answered where an accepted pose agrees with them.
@@ -185,8 +189,12 @@ def _rivals(places: Sequence[_Place], priors: Priors, options: PlaceOptions) -> 
     return rivals
 
 
-def _conflicts(place: _Place, priors: Priors) -> bool:
-    pose = next(iter(place.accepted), place.poses[0])
+def _conflicts(place: Place, priors: Priors) -> bool:
+    return conflicts(next(iter(place.accepted), place.poses[0]), priors)
+
+
+def conflicts(pose: Hypothesis, priors: Priors) -> bool:
+    """Whether one of the priors contradicts a pose."""
     return any(it.conflict for it in priors.check(pose.world_from_camera, pose.covariance))
 
 
@@ -197,10 +205,15 @@ def _scores(hypotheses: Sequence[Hypothesis], found: Sequence[Found]) -> list[fl
     """
     if len(hypotheses) == 1:
         return [0.0]
-    matches = list(_matches(found))
+    matches = list(matches_of(found))
     if not matches:
         return [float(it.inlier_count) for it in hypotheses]
-    return [sum(it.score(pose.world_from_camera) for it in matches) - _by_depth(pose) for pose in hypotheses]
+    return [score(it, matches) for it in hypotheses]
+
+
+def score(pose: Hypothesis, matches: Sequence["Scored"]) -> float:
+    """The score of a pose on matches with references of its world, and on the depth of the photograph."""
+    return sum(it.score(pose.world_from_camera) for it in matches) - _by_depth(pose)
 
 
 def _by_depth(pose: Hypothesis) -> float:
@@ -210,7 +223,7 @@ def _by_depth(pose: Hypothesis) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Scored:
+class Scored:
     """Matches of a photograph with some references: as lines, and where they lead to a point, as points.
 
     The points are those before the vote for a keypoint's point, which removes those of a weaker place; of a keypoint's
@@ -222,7 +235,7 @@ class _Scored:
     origin: Array
 
     @classmethod
-    def of(cls, support: Support, is_used: NDArray[np.bool_]) -> "_Scored":
+    def of(cls, support: Support, is_used: NDArray[np.bool_]) -> "Scored":
         """The matches of a support with these of its references (K,)."""
         lines = TwoViewMatches.of(support.query, support.references, support.query_matches)
         votes, none = votes_of(support), np.empty(0, np.intp)
@@ -240,7 +253,7 @@ class _Scored:
         return relative.score(self.lines, pose) - float(np.log10(disc) * best.sum())
 
 
-def _matches(found: Sequence[Found]) -> Iterator[_Scored]:
+def matches_of(found: Sequence[Found]) -> Iterator[Scored]:
     """All matches with any reference, those of each features once: of the photograph turned they are others."""
     seen: set[tuple[int, Raster, tuple[float, ...], str]] = set()
     for result in reversed(found):
@@ -251,10 +264,10 @@ def _matches(found: Sequence[Found]) -> Iterator[_Scored]:
         is_new = np.array([key not in seen for key in keys])
         if is_new.any():
             seen.update(keys)
-            yield _Scored.of(support, is_new)
+            yield Scored.of(support, is_new)
 
 
-def _at(place: _Place) -> Verdict:
+def _at(place: Place) -> Verdict:
     """The verdict for one place."""
     accepted = place.accepted
     chosen, counted = (accepted[0], accepted) if accepted else (place.poses[0], place.poses)
@@ -286,7 +299,7 @@ def _rejected(found: Sequence[Found], within: Sequence[Hypothesis], priors: Prio
     if len(outcome.hypotheses) != 2 or outcome.hint is not None:
         return verdict
     counts = [float(it.inlier_count) for it in outcome.hypotheses]
-    decided = place_of_priors(outcome.hypotheses, counts, priors, options)
+    decided = place_of_priors(outcome.hypotheses, counts, [priors] * len(counts), options)
     if isinstance(decided, Hint):
         return replace(verdict, outcome=replace(outcome, hint=decided))
     return verdict if decided is None else replace(verdict, place=outcome.hypotheses[decided])
@@ -299,13 +312,13 @@ def _imprecise(
     offered = [it for it in within if isinstance(it.answer.outcome, Rejection) and it.answer.outcome.imprecise]
     if not offered:
         return None
-    place, *others = _rivals(_places_of(within, found, options), priors, options)
+    place, *others = _rivals(places_of(within, found, options), priors, options)
     if others or _conflicts(place, priors):
         return None
     return next((it for it in place.poses if it in offered), None)
 
 
-def _ambiguous(rivals: Sequence[_Place], hint: Hint | None, unit: str) -> Verdict:
+def _ambiguous(rivals: Sequence[Place], hint: Hint | None, unit: str) -> Verdict:
     first, second = (it.as_hypothesis() for it in rivals[:2])
     apart_m, apart_deg = _apart(first.world_from_camera, second.world_from_camera)
     message = (

@@ -61,6 +61,7 @@ class Attempt:
         where: the references that are used.
         matching: how the photographs are matched.
         solver: the matches that give the pose.
+        scene: the scene that the references are of: its rank among several, 0 for the first or only one.
     """
 
     features: int = 0
@@ -69,11 +70,12 @@ class Attempt:
     where: Where = Where.LIKELY
     matching: Matching = Matching.STRICT
     solver: Solver = Solver.POINTS
+    scene: int = 0
 
     @property
     def basis(self) -> "Attempt":
         """The attempt whose photographs and features it uses: attempts of one basis differ in what follows."""
-        return Attempt(self.features, self.raster, self.angles_deg, self.where)
+        return Attempt(self.features, self.raster, self.angles_deg, self.where, scene=self.scene)
 
     def but(self, **changes: object) -> "Attempt":
         """A copy with these values."""
@@ -107,6 +109,8 @@ class Doubt(Flag):
     FEW_INLIERS = auto()
     LIKE_ELSEWHERE = auto()
     """References elsewhere share much with the photograph that does not fit the pose."""
+    OTHER_SCENE = auto()
+    """References of another scene match the photograph, too."""
     CAMERA = auto()
     """The photograph contradicts its camera: no other attempt changes that."""
     REFERENCES = auto()

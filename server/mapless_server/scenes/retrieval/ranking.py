@@ -12,7 +12,7 @@ the photographs and the references' poses only, never the query's pose.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -144,6 +144,41 @@ def rank_references(entries: Entries, vector: Vector | None, selection: Selectio
     rest = np.setdiff1d(np.arange(len(pool)), order)  # in the order of their scores
     chosen = pool[[*order, *rest[: wanted - len(order)]]]
     return [_ranked(entries, int(rows[i]), float(similarity[i])) for i in chosen]
+
+
+def rank_among(
+    scenes: Sequence[tuple[Entries, Narrowing]], vector: Vector, count: int
+) -> list[Sequence[RankedReference]]:
+    """Selects so many references of all of several scenes by the photograph's descriptor (D,).
+
+    In each scene they are spread as in `rank_references`, and thinned later. References without a descriptor are not
+    selected.
+
+    Returns:
+        For each scene, its references, the most similar first.
+    """
+    found = [_similar(entries, narrowing, vector) for entries, narrowing in scenes]
+    everything = np.concatenate([np.empty(0, np.float32), *found])
+    scene = np.repeat(np.arange(len(scenes)), [len(it) for it in found])
+    best = _best(np.where(np.isnan(everything), -np.inf, everything), count)
+    ranked = [
+        (i, it)
+        for i in np.unique(scene[best]).tolist()
+        for it in rank_references(scenes[i][0], vector, Selection(count, scenes[i][1], options=THINNED_LATER))
+        if not math.isnan(it.similarity)
+    ]
+    selected: list[list[RankedReference]] = [[] for _ in scenes]
+    for i, it in sorted(ranked, key=lambda it: -it[1].similarity)[:count]:
+        selected[i].append(it)
+    return [*selected]
+
+
+def _similar(entries: Entries, narrowing: Narrowing, vector: Vector) -> NDArray[np.float32]:
+    """Similarities (N,) of the references within limits and likely values."""
+    rows = entries.rows()
+    if not narrowing.is_empty:
+        rows = rows[narrowing.keeps(entries.centres(rows), entries.axes(rows))]
+    return entries.similarities(vector, rows)
 
 
 def rank_beside(entries: Entries, reference_id: str, count: int) -> list[RankedReference]:
