@@ -31,7 +31,7 @@ TOKENS = Tokens(
     tokens=(
         Token(name="robot", tenant="acme", role="localize", sha256=sha256_of(GOOD)),
         Token(name="old", role="write", sha256=sha256_of("old"), expires=datetime(2026, 1, 1, tzinfo=timezone.utc)),
-        Token(name="reader", role="read", sha256=sha256_of("reader")),
+        Token(name="reader", role="read", sha256=sha256_of("reader"), scenes=("lobby",), labels={"site": "a"}),
     )
 )
 _FILE = "tokens.json"
@@ -175,6 +175,12 @@ def _check_file(contents: list[bytes]) -> bool:
         return False
     assert Tokens.model_validate_json(tokens.model_dump_json(exclude_none=True)) == tokens
     for token in tokens.tokens:
+        if token.limit is None:
+            assert (token.scenes, token.labels) == (None, None)
+        else:  # never an empty one, which would be read as none
+            assert token.limit.scene_ids == frozenset(token.scenes or ())
+            assert token.limit.labels == frozenset((token.labels or {}).items())
+            assert token.limit.scene_ids or token.limit.labels
         assert tokens.rate_ms(token.tenant) is None or 0 <= (tokens.rate_ms(token.tenant) or 0) < float("inf")
     return True
 
@@ -211,5 +217,6 @@ TARGET = Target(
         GOOD.encode(),
         folders.SEPARATOR,
     )
-    + (b'"role": "write"', b'"expires": "2027-01-01T00:00:00Z"', b'"rate_ms": 0', b'"sha256": ', b'"tenants": '),
+    + (b'"role": "write"', b'"expires": "2027-01-01T00:00:00Z"', b'"rate_ms": 0', b'"sha256": ', b'"tenants": ')
+    + (b'"scenes": ["lobby"]', b'"scenes": []', b'"labels": {"site": "a"}', b'"labels": {}'),
 )

@@ -48,7 +48,7 @@ class Unauthenticated(RequestError):
 
 
 class PermissionDenied(RequestError):
-    """The caller is known, and its role does not allow this."""
+    """The caller is known, and its role, or the scenes that its token is for, do not allow this."""
 
     code = "PERMISSION_DENIED"
 

@@ -28,6 +28,7 @@ from mapless_server.security import (
     Authenticator,
     Principal,
     Role,
+    SceneLimit,
     SecurityError,
     Tokens,
     certificate_name,
@@ -86,6 +87,23 @@ class TestFile:
         create_token(path, "a", "acme", "read", None)
         tokens = read_tokens(path)
         assert [tokens.rate_ms(tenant) for tenant in ("acme", "other", "unknown")] == [250, None, None]
+
+    def test_a_limit_is_kept_and_reaches_the_caller(self, path: Path) -> None:
+        limits: list[tuple[dict[str, Any], SceneLimit | None]] = [
+            ({}, None),
+            ({"scenes": ["lobby", "hall"]}, SceneLimit(frozenset({"lobby", "hall"}))),
+            ({"labels": {"site": "a"}}, SceneLimit(labels=frozenset({("site", "a")}))),
+            (
+                {"scenes": ["lobby"], "labels": {"site": "a"}},
+                SceneLimit(frozenset({"lobby"}), frozenset({("site", "a")})),
+            ),
+        ]
+        for number, (held, expected) in enumerate(limits):
+            token = create_token(path, f"t{number}", "acme", "read", None, **held)
+            caller = Authenticator(lambda: read_tokens(path)).authenticate(bearer(token), READ)
+            assert caller == Principal("acme", Role.READ, f"t{number}", expected)
+        revoke_token(path, "t0")
+        assert [it.limit for it in read_tokens(path).tokens] == [expected for _, expected in limits[1:]]
 
     def test_a_taken_name_is_refused_and_nothing_changes(self, path: Path) -> None:
         create_token(path, "a", "acme", "read", None)
@@ -147,6 +165,14 @@ class TestFile:
             (json.dumps({"tokens": [entry(expires="2030-01-01T00:00:00")]}), "tokens.0.expires: .*timezone"),
             (json.dumps({"tokens": [entry(), entry(sha256=sha256_of("b"))]}), "two tokens have the name 'robot'"),
             (json.dumps({"tokens": [entry(), entry(name="b")]}), "two tokens have the sha256"),
+            (json.dumps({"tokens": [entry(scenes=[])]}), "tokens.0.scenes: .*at least 1 item"),
+            (json.dumps({"tokens": [entry(labels={})]}), "tokens.0.labels: .*at least 1 item"),
+            (json.dumps({"tokens": [entry(scenes="lobby")]}), "tokens.0.scenes: .*array"),
+            (json.dumps({"tokens": [entry(scene=["lobby"])]}), "tokens.0.scene: Extra inputs"),
+            (json.dumps({"tokens": [entry(scenes=["scenes/lobby"])]}), "tokens.0.scenes.0: an id is"),
+            (json.dumps({"tokens": [entry(scenes=["s"] * 1001)]}), "tokens.0.scenes: .*at most 1000"),
+            (json.dumps({"tokens": [entry(labels={"si te": "a"})]}), "tokens.0.labels: must have names"),
+            (json.dumps({"tokens": [entry(labels={"site": ""})]}), "tokens.0.labels: must have values"),
             ('{"tenants": {"a": {"rate_ms": -1}}}', "tenants.a.rate_ms"),
             ('{"tenants": {"a/b": {}}}', "tenants.a/b"),
         ],
@@ -364,7 +390,7 @@ class TestCommand:
             datetime(2099, 1, 1, tzinfo=timezone.utc),
         )
         (entry,) = json.loads(self.run("list", path=path)[1])  # for programs, without the hash
-        assert {*entry} == {"name", "tenant", "role", "expires"}
+        assert {*entry} == {"name", "tenant", "role", "expires", "scenes", "labels"}
         code, listed, _ = self.run("list", "--text", path=path)
         assert code == 0
         assert listed == "robot-7  localize  tenant acme  expires 2099-01-01T00:00:00+00:00\n"
@@ -380,6 +406,10 @@ class TestCommand:
             (("create", "--name", "a", "--role", "read", "--expires", "soon"), 2, "--expires"),
             (("create", "--name", "a", "--role", "read", "--expires", "2099-01-01T00:00:00"), 2, "--expires"),
             (("create", "--name", "a", "--role", "read", "--expires", "2001-01-01T00:00:00Z"), 2, "in the future"),
+            (("create", "--name", "a", "--role", "read", "--scene", "scenes/lobby"), 1, "scenes.0: an id is"),
+            (("create", "--name", "a", "--role", "read", "--label", "site"), 2, "NAME=VALUE, not 'site'"),
+            (("create", "--name", "a", "--role", "read", "--label", "s=a", "--label", "s=b"), 2, "no scene has both"),
+            (("create", "--name", "a", "--role", "read", "--label", "=a"), 1, "labels: must have names"),
             (("create", "--name", "old", "--role", "read"), 1, "already"),
             (("revoke", "a"), 1, "no token"),
             (("create", "--role", "read"), 2, "one name"),
@@ -391,6 +421,17 @@ class TestCommand:
         found_code, printed, said = self.run(*arguments, path=path)
         assert (found_code, printed, said.count("\n")) == (code, "", 1)
         assert error_text in said
+
+    def test_the_list_shows_what_a_token_is_for(self, path: Path) -> None:
+        limit = ("--scene", "lobby", "--scene", "hall", "--label", "site=a", "--label", "floor=2")
+        assert self.run("create", "--name", "a", "--role", "read", *limit, path=path)[0] == 0
+        many = [part for number in range(7) for part in ("--scene", f"s{number}")]
+        assert self.run("create", "--name", "b", "--role", "read", *many, path=path)[0] == 0
+        first, second = self.run("list", "--text", path=path)[1].splitlines()
+        assert first.endswith("  only lobby, hall and scenes with site=a, floor=2")
+        assert second.endswith("  only s0, s1, s2, s3, s4 and 2 more")
+        listed = json.loads(self.run("list", path=path)[1])
+        assert (listed[0]["scenes"], listed[0]["labels"]) == (["lobby", "hall"], {"site": "a", "floor": "2"})
 
     def test_the_setting_names_the_file(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """The client's variable MAPLESS_TOKEN is no setting, and no error."""

@@ -15,7 +15,7 @@ from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.method.features.views import View
 from mapless_server.scenes.audit.verdict import AuditVerdict, ReferenceAudit
-from mapless_server.security import key_of
+from mapless_server.security import Principal, key_of
 from mapless_server.services.references import ReferenceService
 from mapless_server.store import NewReference, Store
 
@@ -53,7 +53,7 @@ async def page(service: ReferenceService, method: str, token: str = "", tenant: 
     request: Any = type(LISTS[method])()
     request.CopyFrom(LISTS[method])
     request.page_token = token
-    call: Any = SimpleNamespace(principal=SimpleNamespace(tenant=tenant), caller=None, note=lambda **_: None)
+    call: Any = SimpleNamespace(principal=Principal(tenant), caller=None, note=lambda **_: None)
     answer = await getattr(service, method)(request, call)
     (items,) = (value for field, value in answer.ListFields() if field.message_type is not None)
     return [it.name.rpartition("/")[2] for it in items], answer.next_page_token

@@ -24,6 +24,7 @@ from mapless_server.engine.options import EngineOptions
 from mapless_server.errors import RequestError
 from mapless_server.observability.metrics import Metrics
 from mapless_server.rpc import Call
+from mapless_server.security import Principal
 from mapless_server.services.handlers import Services
 from mapless_server.services.localization import LocalizationService
 from mapless_server.services.references import ReferenceService
@@ -88,7 +89,7 @@ def refusal(method: str, request: Message) -> FieldError | RequestError:
     """The error by which a service refuses a request; it has neither queue nor store, so nothing else can happen."""
     engine: Any = SimpleNamespace(options=EngineOptions())
     store: Any = SimpleNamespace(get_attributes=lambda _: SceneAttributes())
-    call: Any = SimpleNamespace(principal=SimpleNamespace(tenant="acme"), note=lambda **_: None)
+    call: Any = SimpleNamespace(principal=Principal("acme"), note=lambda **_: None)
     nothing: Any = None
     localization = LocalizationService(lambda: engine, nothing, store, nothing)
     references = ReferenceService(lambda: engine, store)

@@ -9,8 +9,8 @@ from sqlalchemy import event
 from support.stores import Place, Shared, make_reference
 
 from mapless.geodesy import Datum
-from mapless_server.errors import DataLoss
-from mapless_server.security import DEFAULT_TENANT, SceneKey, key_of
+from mapless_server.errors import DataLoss, NotFound
+from mapless_server.security import DEFAULT_TENANT, SceneKey, SceneLimit, key_of, scene_id_of
 from mapless_server.store import GroupedScene, SceneAttributes, Store
 
 A, B, HALL = SceneKey("a"), SceneKey("b"), SceneKey("hall")
@@ -75,6 +75,49 @@ def test_a_groups_scenes_are_as_each_is_alone(store: Store) -> None:
             assert (scene.generation, scene.create_time_us, scene.attributes) == expected
 
 
+def limit_of(*scene_ids: str, **labels: str) -> SceneLimit:
+    return SceneLimit(frozenset(scene_ids), frozenset(labels.items()))
+
+
+LIMITS = (limit_of("a", "x"), limit_of(site="north"), limit_of("b", site="north", floor="2"), limit_of("x", site="x"))
+
+
+@pytest.mark.parametrize("limit", LIMITS)
+def test_every_look_up_keeps_to_the_limit(store: Store, limit: SceneLimit) -> None:
+    labels: dict[str, dict[str, str]] = {"a": {}, "b": NORTH, "hall": NORTH | {"floor": "2"}, "yard": {"floor": "2"}}
+    for tenant in (DEFAULT_TENANT, "acme"):
+        for scene_id, its in labels.items():
+            store.create_scene(key_of(tenant, scene_id), labels=its)
+    for tenant in (DEFAULT_TENANT, "acme"):
+        expected = [key_of(tenant, it) for it in labels if limit.holds(it, labels[it])]
+        assert keys_of(store.find_scenes(tenant, limit=limit)) == expected
+        assert [it.scene_key for it in store.list_scenes(tenant, 10, limit=limit)] == expected
+        of_group = [it for it in expected if labels[scene_id_of(it)].get("floor") == "2"]
+        assert keys_of(store.find_scenes(tenant, {"floor": "2"}, limit)) == of_group
+        assert [key_of(tenant, it) for it in labels if it in store.find_within(tenant, labels, limit)] == expected
+        for scene_id in labels:
+            key = key_of(tenant, scene_id)
+            if key in expected:
+                assert store.update_scene(key, labels=labels[scene_id], limit=limit).scene_key == key
+            else:
+                with pytest.raises(NotFound, match=f"there is no scene '{scene_id}'"):
+                    store.update_scene(key, labels=NORTH | {"floor": "2"}, limit=limit)
+
+
+def test_scenes_within_a_limit_are_asked_for_once(place: Place) -> None:
+    with place.open() as store:
+        store.create_scene(A, labels=NORTH)
+        store.create_scene(B)
+        for limit, count in ((limit_of("a", "b"), 0), (limit_of(site="north"), 1)):
+            with statements(store) as first:
+                found = store.find_within(DEFAULT_TENANT, ["a"], limit)
+            with statements(store) as second:
+                assert store.find_within(DEFAULT_TENANT, ["a"], limit) == found == {"a"}
+            assert (len(first), len(second)) == (count, count if isinstance(place, Shared) else 0)
+        store.update_scene(A, labels={})
+        assert store.find_within(DEFAULT_TENANT, ["a"], limit_of(site="north")) == frozenset()
+
+
 CHANGES: dict[str, Callable[[Store], object]] = {
     "create": lambda store: store.create_scene(HALL, labels=NORTH),
     "delete": lambda store: store.delete_scene(A),
@@ -109,13 +152,15 @@ def test_every_change_counts_at_once(place: Place, change: str, is_others: bool)
             assert (scene.generation, scene.attributes) == (expected.generation, expected.attributes)
 
 
-def test_an_unchanged_scene_stays_the_same_object(store: Store) -> None:
+def test_an_unchanged_scene_or_group_stays_the_same_object(store: Store) -> None:
     store.create_scene(A, OUTDOORS)
     store.create_scene(B, DOWN)
     before = store.find_scenes(DEFAULT_TENANT)
     store.update_scene(B, down_in_world=None)
     after = store.find_scenes(DEFAULT_TENANT)
     assert [now is then for now, then in zip(after, before, strict=True)] == [True, False]
+    store.create_scene(key_of("acme", "a"))
+    assert store.find_scenes(DEFAULT_TENANT) is after
 
 
 def test_a_group_is_read_in_one_statement_and_not_again(place: Place) -> None:

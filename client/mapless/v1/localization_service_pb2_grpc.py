@@ -111,7 +111,7 @@ class LocalizationServiceServicer(object):
 
         * INVALID_ARGUMENT: a bad image, camera or field.
         * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include localizing.
-        * NOT_FOUND: no such scene or reference. Another tenant's is not found either.
+        * NOT_FOUND: no such scene or reference. Another tenant's is not found either, nor one that the token is not for.
         * RESOURCE_EXHAUSTED with RetryInfo: too many calls wait, so that there is no room for this one or it would not be
         answered before its deadline; or the tenant has used up the computing time it is granted. Nothing was computed.
         * DEADLINE_EXCEEDED: the deadline passed, or leaves too little time for the work itself, however idle the server.

@@ -33,13 +33,15 @@ class ReferenceServiceStub(object):
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
 
     A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
-    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
+    its id is free. A token may be for some scenes of its tenant only, by their ids or labels: to it the others do not exist
+    either, but their ids are taken. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
     `x-mapless-scene`.
 
     Errors are google.rpc.Status with details as LocalizationService's; a BadRequest names the field. Beside what stands with each call, any of them may fail with
 
     * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
-    looking takes the role read, changing the role write.
+    looking takes the role read, changing the role write. Or, with the reason SCENE_LIMIT, a scene that is created or gets
+    other labels would not be one of those that the token is for.
     * RESOURCE_EXHAUSTED with RetryInfo, where photographs are uploaded: too many calls wait, so that there is no room for
     this one or it would not be done before its deadline; or the tenant has used up the computing time it is granted.
     Nothing was stored. A message over the server's limit is RESOURCE_EXHAUSTED without RetryInfo.
@@ -129,13 +131,15 @@ class ReferenceServiceServicer(object):
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
 
     A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
-    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
+    its id is free. A token may be for some scenes of its tenant only, by their ids or labels: to it the others do not exist
+    either, but their ids are taken. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
     `x-mapless-scene`.
 
     Errors are google.rpc.Status with details as LocalizationService's; a BadRequest names the field. Beside what stands with each call, any of them may fail with
 
     * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
-    looking takes the role read, changing the role write.
+    looking takes the role read, changing the role write. Or, with the reason SCENE_LIMIT, a scene that is created or gets
+    other labels would not be one of those that the token is for.
     * RESOURCE_EXHAUSTED with RetryInfo, where photographs are uploaded: too many calls wait, so that there is no room for
     this one or it would not be done before its deadline; or the tenant has used up the computing time it is granted.
     Nothing was stored. A message over the server's limit is RESOURCE_EXHAUSTED without RetryInfo.
@@ -324,13 +328,15 @@ class ReferenceService(object):
     Anything else is INVALID_ARGUMENT; a well-formed name of something that does not exist is NOT_FOUND.
 
     A scene belongs to the tenant whose token created it; to every other tenant it does not exist, in any call or list, and
-    its id is free. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
+    its id is free. A token may be for some scenes of its tenant only, by their ids or labels: to it the others do not exist
+    either, but their ids are taken. Request metadata is LocalizationService's: `authorization`, `x-request-id`, `x-client-id`,
     `x-mapless-scene`.
 
     Errors are google.rpc.Status with details as LocalizationService's; a BadRequest names the field. Beside what stands with each call, any of them may fail with
 
     * UNAUTHENTICATED: the token is missing, unknown or expired. PERMISSION_DENIED: its role does not include the call;
-    looking takes the role read, changing the role write.
+    looking takes the role read, changing the role write. Or, with the reason SCENE_LIMIT, a scene that is created or gets
+    other labels would not be one of those that the token is for.
     * RESOURCE_EXHAUSTED with RetryInfo, where photographs are uploaded: too many calls wait, so that there is no room for
     this one or it would not be done before its deadline; or the tenant has used up the computing time it is granted.
     Nothing was stored. A message over the server's limit is RESOURCE_EXHAUSTED without RetryInfo.

@@ -237,7 +237,7 @@ class CallGuard:
         del request  # it has a photograph, which a slow reader must not keep in memory
         limit_s, sent_bytes = ENDLESS_SEND_LIMIT_S if is_endless else SEND_LIMIT_S, 0
         messages = (
-            self._endless(opening, method, handler, context)
+            self._endless(opening, method, handler, call, context)
             if is_endless
             else self._finite(opening, handler, call, context)
         )
@@ -252,14 +252,15 @@ class CallGuard:
             call.note(bytes_out=sent_bytes)
 
     async def _endless(
-        self, opening: Opening, method: str, handler: Any, context: Context
+        self, opening: Opening, method: str, handler: Any, call: Call, context: Context
     ) -> AsyncGenerator[bytes, None]:
         """Yields a servicer's messages, each after the previous one is sent; sends headers when messages can come."""
         async with aclosing(await opening) as responses:
             await self._sender.headers(context)
             async for response in responses:
-                # The token may have been revoked, or have expired, since.
-                self._principal(method, context)
+                # The token may have been revoked, have expired or been changed since.
+                if self._principal(method, context) != call.principal:
+                    raise Unavailable("the rights of the token have changed: call again", reason="TOKEN_CHANGED")
                 yield bytes(handler.response_serializer(response))
 
     async def _finite(

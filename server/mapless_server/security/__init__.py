@@ -10,6 +10,7 @@ from .access import (
     ENDLESS_METHODS,
     KEY_SEPARATOR,
     METHOD_ROLES,
+    NOWHERE,
     OPEN_METHODS,
     Authenticator,
     Principal,
@@ -27,4 +28,5 @@ from .access import (
 from .binding import assess_binding, is_loopback
 from .rate import RateLimiter
 from .reloading import SecurityError
+from .scene_limit import SceneLimit
 from .tokens import create_token, read_tokens, revoke_token, written_secret

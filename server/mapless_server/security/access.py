@@ -15,11 +15,18 @@ from typing import Annotated, Literal, NewType
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field, model_validator
 
+from mapless.labels import check_labels
 from mapless.names import check_id
 from mapless_server.errors import PermissionDenied, Unauthenticated
 
+from .scene_limit import MAX_LIMIT_SCENES, SceneLimit
+
 DEFAULT_TENANT = "default"
 """The tenant of all scenes on a server without tokens."""
+
+NOWHERE = "~"
+"""A tenant that has no scenes, since no tenant can have this name. The scenes that a token is not for are looked up
+here, so that they are in everything as scenes that do not exist."""
 
 
 class Role(IntEnum):
@@ -35,11 +42,15 @@ class Role(IntEnum):
 
 @dataclass(frozen=True)
 class Principal:
-    """A caller, with its rights on its tenant's scenes, and the name of its token or certificate, if any."""
+    """A caller, with its rights on its tenant's scenes, and the name of its token or certificate, if any.
+
+    For a caller with a limit only the scenes within it exist; None for all scenes of the tenant.
+    """
 
     tenant: str = DEFAULT_TENANT
     role: Role = Role.WRITE
     name: str = ""
+    limit: SceneLimit | None = None
 
     @property
     def holder(self) -> tuple[str, str]:
@@ -91,7 +102,10 @@ Name = Annotated[str, AfterValidator(check_id)]
 
 
 class Token(BaseModel):
-    """An entry of the file, with the unique name of its holder, and the hexadecimal hash of the token."""
+    """An entry of the file, with the unique name of its holder, and the hexadecimal hash of the token.
+
+    With `scenes` or `labels` it is limited to the scenes of these ids, and to those with all of these labels.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -100,6 +114,15 @@ class Token(BaseModel):
     role: Literal["read", "localize", "write"]
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     expires: AwareDatetime | None = None
+    scenes: tuple[Name, ...] | None = Field(default=None, min_length=1, max_length=MAX_LIMIT_SCENES)
+    labels: Annotated[dict[str, str], AfterValidator(check_labels)] | None = Field(default=None, min_length=1)
+
+    @cached_property
+    def limit(self) -> SceneLimit | None:
+        """The scenes that it is limited to; None for all of its tenant."""
+        if self.scenes is None and self.labels is None:
+            return None
+        return SceneLimit(frozenset(self.scenes or ()), frozenset((self.labels or {}).items()))
 
     @property
     def allows(self) -> Role:
@@ -235,7 +258,7 @@ class Authenticator:
                 f"{token.role}",
                 reason="ROLE_TOO_LOW",
             )
-        return Principal(token.tenant, token.allows, token.name)
+        return Principal(token.tenant, token.allows, token.name, token.limit)
 
 
 def certificate_name(auth_context: Mapping[str, Iterable[bytes]]) -> str:

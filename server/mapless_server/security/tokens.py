@@ -4,7 +4,7 @@ A token is 32 random bytes, so a plain SHA-256 is enough: slow hashes are for pa
 is JSON, which programs can read and write:
 
     {"tokens": [{"name": "robot-7", "tenant": "acme", "role": "localize", "sha256": "...",
-                 "expires": "2027-01-01T00:00:00Z"}],
+                 "expires": "2027-01-01T00:00:00Z", "scenes": ["lobby"], "labels": {"site": "a"}}],
      "tenants": {"acme": {"rate_ms": 500}}}
 """
 
@@ -12,7 +12,7 @@ import fcntl
 import logging
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -45,13 +45,24 @@ def read_tokens(path: Path) -> Tokens:
         raise SecurityError(str(error)) from None
 
 
-def create_token(path: Path, name: str, tenant: str, role: str, expires: datetime | None) -> str:
+def create_token(
+    path: Path,
+    name: str,
+    tenant: str,
+    role: str,
+    expires: datetime | None,
+    *,
+    scenes: Sequence[str] | None = None,
+    labels: Mapping[str, str] | None = None,
+) -> str:
     """Creates a token and adds its hash to the file, which is created if missing; returns the token.
 
+    With `scenes` or `labels` it is limited to the scenes of these ids, and to those with all of these labels.
     SecurityError if the name is taken, a value is wrong, or the file cannot be read or written.
     """
     token = PREFIX + secrets.token_urlsafe(_TOKEN_BYTES)
-    fields = {"name": name, "tenant": tenant, "role": role, "sha256": sha256_of(token), "expires": expires}
+    fields: dict[str, object] = {"name": name, "tenant": tenant, "role": role, "sha256": sha256_of(token)}
+    fields |= {"expires": expires, "scenes": scenes, "labels": labels}
     try:
         new = Token.model_validate(fields)
     except ValidationError as error:

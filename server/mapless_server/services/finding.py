@@ -11,6 +11,7 @@ from mapless_server.store import Store
 
 from .messages.references import labels_from_message
 from .messages.scenes import FoundScenes, scene_keys_from_message
+from .reach import Reach
 
 CACHED_SCENES = 100_000
 """Scenes of all groups together that are kept, some 40 MB; the latest group is, however large."""
@@ -19,12 +20,13 @@ CACHED_SCENES = 100_000
 class SceneFinder:
     """Finds scenes by name or by label; from any thread."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, reach: Reach) -> None:
         self._store = store
+        self._reach = reach
         self._groups: LruCache[FoundScenes] = LruCache(CACHED_SCENES, keeps_latest=True)
 
     def find(self, request: pb.LocalizeRequest, principal: Principal) -> FoundScenes:
-        """The scenes that a request lists, or those of its group.
+        """The scenes that a request lists, or those of its group that are within the caller's reach.
 
         FieldError names a wrong field; NotFound has the field scenes[i] of a scene that does not exist, or scene_group
         if no scene is in it.
@@ -34,7 +36,8 @@ class SceneFinder:
         return self._group(labels_from_message(request.scene_group.labels, "scene_group.labels"), principal)
 
     def _named(self, request: pb.LocalizeRequest, principal: Principal) -> FoundScenes:
-        keys = scene_keys_from_message(request, principal.tenant)
+        listed = scene_keys_from_message(request, principal.tenant)
+        keys = self._reach.keys(principal, [scene_id_of(it) for it in listed])
         found = self._store.find_scenes_named(keys)
         if found.missing:
             missing = found.missing[0]
@@ -43,11 +46,11 @@ class SceneFinder:
         return FoundScenes(found.found)
 
     def _group(self, labels: Mapping[str, str], principal: Principal) -> FoundScenes:
-        scenes = self._store.find_scenes(principal.tenant, labels)
+        scenes = self._store.find_scenes(principal.tenant, labels, principal.limit)
         if not scenes:
             having = names.shown(", ".join(f"{name}={value}" for name, value in labels.items()))
             raise NotFound(f"there is no scene with {having}" if labels else "there is no scene", field="scene_group")
-        name = principal.tenant, frozenset(labels.items())
+        name = principal.tenant, frozenset(labels.items()), principal.limit
         known = self._groups.get(name)
         if known is None or known.scenes is not scenes:
             known = FoundScenes(scenes)

@@ -27,7 +27,7 @@ from mapless_server.method.rejection import Rejection
 from mapless_server.method.structure.model import MetricScale
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc import Call
-from mapless_server.security import Principal, SceneKey
+from mapless_server.security import NOWHERE, Principal, SceneKey, tenant_of
 from mapless_server.store import SceneAttributes, Store
 
 from .capture.calls import Request, Response
@@ -45,8 +45,9 @@ from .messages.groups import (
     with_tracked_motion,
 )
 from .messages.priors import needs_attributes
-from .messages.queries import query_among, query_from_message, scene_key_from_name
+from .messages.queries import query_among, query_from_message
 from .messages.scenes import names_several, questions_from_message
+from .reach import Reach
 from .watching import Watcher, Watchers
 
 if TYPE_CHECKING:  # services do not load what computes
@@ -77,7 +78,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._engine = engine
         self._metrics = metrics
         self._store = store
-        self._scenes = SceneFinder(store)
+        self._reach = Reach(store)
+        self._scenes = SceneFinder(store, self._reach)
         self._watchers = watchers
         self._recorder = recorder
 
@@ -95,14 +97,14 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     async def _query(self, request: pb.LocalizeRequest, call: Call) -> tuple[Query, AnswerFrames]:
         """Converts a request to a query; FieldError or RequestError names the wrong field."""
-        options, tenant = self._engine().options, call.principal.tenant
-        frames = answer_frames_of(request)
+        options, frames = self._engine().options, answer_frames_of(request)
         if names_several(request):
             questions, prior_scene = await asyncio.to_thread(self._questions, request, call.principal)
             call.note(scenes=len(questions))
             return query_among(request, options, questions, prior_scene), frames
-        attributes = await self._attributes([request], request.scene, tenant)
-        query = query_from_message(request, tenant, options, attributes)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
+        attributes = await self._attributes([request], scene_key)
+        query = query_from_message(request, tenant_of(scene_key), options, attributes)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
         return query, frames
 
@@ -207,11 +209,18 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     async def WatchQueries(self, request: pb.WatchQueriesRequest, call: Call) -> Watcher:
         """Implements LocalizationService.WatchQueries."""
-        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
         call.note(scene=scene_key)
         self._watchers.check(call.principal.tenant)
         await asyncio.to_thread(self._store.get_scene, scene_key)
-        return self._watchers.watch(scene_key)
+        is_limited = call.principal.limit is not None
+        return self._watchers.watch(scene_key, partial(self._check_reach, request, call) if is_limited else None)
+
+    async def _check_reach(self, request: pb.WatchQueriesRequest, call: Call) -> None:
+        """Raises NotFound if the scene is out of the call's reach by now."""
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
+        if tenant_of(scene_key) == NOWHERE:
+            await asyncio.to_thread(self._store.get_scene, scene_key)
 
     async def _queries(
         self,
@@ -221,15 +230,15 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         call: Call,
     ) -> tuple[Query, ...]:
         """Converts the photographs of a request to queries; FieldError or RequestError names the wrong field."""
-        tenant = call.principal.tenant
-        attributes = await self._attributes(getattr(request, list_name), request.scene, tenant)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
+        tenant, attributes = tenant_of(scene_key), await self._attributes(getattr(request, list_name), scene_key)
         return queries_from_message(request, list_name, bounds, tenant, self._engine().options, attributes)
 
-    async def _attributes(self, photos: Sequence[Any], scene: str, tenant: str) -> SceneAttributes:
+    async def _attributes(self, photos: Sequence[Any], scene_key: SceneKey) -> SceneAttributes:
         """Attributes of the scene, if the priors of one of the photographs' messages need them."""
         if not any(map(needs_attributes, photos)):
             return SceneAttributes()
-        return await asyncio.to_thread(self._store.get_attributes, scene_key_from_name(scene, "scene", tenant))
+        return await asyncio.to_thread(self._store.get_attributes, scene_key)
 
     async def _localize_group(
         self,

@@ -21,7 +21,7 @@ from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound
 from mapless_server.rpc import Call
 from mapless_server.scenes import Viewpoint
-from mapless_server.security import SceneKey, key_of, scene_id_of
+from mapless_server.security import NOWHERE, SceneKey, key_of, scene_id_of, tenant_of
 from mapless_server.store import (
     ContradictingDown,
     DatumWithoutMetres,
@@ -37,8 +37,6 @@ from .messages.priors import priors_from_message
 from .messages.queries import (
     photo_from_message,
     reference_ids_from_names,
-    reference_key_from_name,
-    scene_key_from_name,
     with_depth,
 )
 from .messages.references import (
@@ -55,6 +53,7 @@ from .messages.references import (
     reference_to_message,
     scene_to_message,
 )
+from .reach import Reach, check_stays_in_reach
 
 if TYPE_CHECKING:  # services do not load what computes
     from mapless_server.engine.queue_engine import QueueEngine
@@ -88,6 +87,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         """`engine` returns the engine; it raises Unavailable while the server starts."""
         self._engine = engine
         self._store = store
+        self._reach = Reach(store)
         self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
 
     def close(self) -> None:
@@ -99,12 +99,13 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         scene_id = wire.checked_id(request.scene_id, "scene_id")
         key, attributes = key_of(call.principal.tenant, scene_id), attributes_from_message(request)
         labels = labels_from_message(request.labels, "labels")
+        check_stays_in_reach(call, scene_id, labels, "scene_id")
         scene = await self._stored(self._store.create_scene, key, attributes, labels)
         return pb.CreateSceneResponse(scene=scene_to_message(scene))
 
     async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
         """Implements ReferenceService.GetScene."""
-        key = scene_key_from_name(request.name, "name", call.principal.tenant)
+        key = await self._reach.scene_key(call, request.name, "name")
         scene = await self._stored(self._store.get_scene, key)
         agreement = await self._agreement(key)
         pending = await self._stored(self._engine().references.pending, key)
@@ -139,10 +140,12 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:
         """Implements ReferenceService.UpdateScene."""
-        key = scene_key_from_name(request.scene.name, "scene.name", call.principal.tenant)
-        changes = changes_from_message(request)
+        key = await self._reach.scene_key(call, request.scene.name, "scene.name")
+        changes, limit = changes_from_message(request), call.principal.limit
+        if "labels" in changes and tenant_of(key) != NOWHERE:
+            check_stays_in_reach(call, scene_id_of(key), changes["labels"], "scene.labels")
         try:
-            scene = await self._stored(partial(self._store.update_scene, key, **changes))
+            scene = await self._stored(partial(self._store.update_scene, key, **changes, limit=limit))
         except ContradictingDown as error:
             field = "down_in_world" if changes.get("down_in_world") else "datum"
             raise FieldError(f"scene.{field}", str(error)) from None
@@ -179,16 +182,16 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
         """Implements ReferenceService.ListScenes."""
-        tenant = call.principal.tenant
+        tenant, limit = call.principal.tenant, call.principal.limit
         labels = labels_from_message(request.labels, "labels")
         page = Page(request, tenant, f"scenes {sorted(labels.items())}" if labels else "scenes")
-        found = await self._stored(self._store.list_scenes, tenant, page.limit, page.after, labels)
+        found = await self._stored(self._store.list_scenes, tenant, page.limit, page.after, labels, limit)
         scenes, token = page.cut(found, lambda scene: scene.scene_id)
         return pb.ListScenesResponse(scenes=await _many(scene_to_message, scenes), next_page_token=token)
 
     async def DeleteScene(self, request: pb.DeleteSceneRequest, call: Call) -> pb.DeleteSceneResponse:
         """Implements ReferenceService.DeleteScene."""
-        scene_key = scene_key_from_name(request.name, "name", call.principal.tenant)
+        scene_key = await self._reach.scene_key(call, request.name, "name")
         await self._stored(self._delete_scene, self._engine(), scene_key)
         return pb.DeleteSceneResponse()
 
@@ -201,7 +204,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def CreateReference(self, request: pb.CreateReferenceRequest, call: Call) -> pb.CreateReferenceResponse:
         """Implements ReferenceService.CreateReference."""
-        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
         draft = self._draft(request, "")
         try:
             (record,), warnings = await self._add(scene_key, [draft], call)
@@ -213,7 +216,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         self, request: pb.BatchCreateReferencesRequest, call: Call
     ) -> pb.BatchCreateReferencesResponse:
         """Implements ReferenceService.BatchCreateReferences."""
-        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
         if not 1 <= len(request.requests) <= MAX_BATCH:
             raise FieldError("requests", f"must be 1 to {MAX_BATCH}, are {len(request.requests)}")
         seen: set[str] = set()
@@ -233,7 +236,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def GetReference(self, request: pb.GetReferenceRequest, call: Call) -> pb.GetReferenceResponse:
         """Implements ReferenceService.GetReference."""
-        key, reference_id = reference_key_from_name(request.name, "name", call.principal.tenant)
+        key, reference_id = await self._reach.reference_key(call, request.name, "name")
         record = await self._stored(self._store.get_reference, key, reference_id)
         message = reference_to_message(record)
         if request.include_image:
@@ -247,7 +250,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def ListReferences(self, request: pb.ListReferencesRequest, call: Call) -> pb.ListReferencesResponse:
         """Implements ReferenceService.ListReferences."""
-        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
         page = Page(request, call.principal.tenant, request.scene)
         found = await self._stored(self._store.list_references, scene_key, page.limit, page.after)
         references, token = page.cut(found, lambda reference: reference.reference_id)
@@ -256,7 +259,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def DeleteReference(self, request: pb.DeleteReferenceRequest, call: Call) -> pb.DeleteReferenceResponse:
         """Implements ReferenceService.DeleteReference."""
-        named = reference_key_from_name(request.name, "name", call.principal.tenant)
+        named = await self._reach.reference_key(call, request.name, "name")
         await self._stored(self._delete_reference, self._engine(), *named)
         return pb.DeleteReferenceResponse()
 
@@ -268,7 +271,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     ) -> pb.RetrieveReferencesResponse:
         """Implements ReferenceService.RetrieveReferences."""
         engine = self._engine()
-        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
         if not 0 <= request.count <= MAX_RETRIEVED:
             raise FieldError("count", f"must be 0 to {MAX_RETRIEVED}, is {request.count}")
         narrowing, _ = priors_from_message(request, SceneAttributes())
@@ -280,7 +283,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def AuditScene(self, request: pb.AuditSceneRequest, call: Call) -> pb.AuditSceneResponse:
         """Implements ReferenceService.AuditScene."""
         engine = self._engine()
-        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
         reference_ids, token = await self._audit_page(request, scene_key, call)
         if not reference_ids:
             generation = await self._stored(self._store.get_generation, scene_key)
@@ -303,7 +306,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def CheckCoverage(self, request: pb.CheckCoverageRequest, call: Call) -> pb.CheckCoverageResponse:
         """Implements ReferenceService.CheckCoverage."""
         engine = self._engine()
-        scene_key = scene_key_from_name(request.scene, "scene", call.principal.tenant)
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
         for field in ("world_from_camera", "intrinsics"):
             if not request.HasField(field):
                 raise FieldError(field, "is required")

@@ -9,7 +9,7 @@ dictionary.
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
@@ -27,14 +27,23 @@ QUEUE_LENGTH = 3
 _Watched = tuple[bytes, geometry_pb.CameraIntrinsics, pb.LocalizeResponse]
 """A photograph as it was sent, its camera, and the answer with its matches."""
 
+Check = Callable[[], Awaitable[None]]
+"""Raises the error with which a watcher ends."""
+
 
 class Watcher:
     """The messages to one watcher of a scene, an asynchronous iterator; ends with Unavailable when the server stops."""
 
-    def __init__(self, unregister: "Callable[[Watcher], None]", max_message_bytes: int) -> None:
-        """Calls `unregister` when closed; messages above the limit are sent without their photograph."""
+    def __init__(
+        self, unregister: "Callable[[Watcher], None]", max_message_bytes: int, check: Check | None = None
+    ) -> None:
+        """Calls `unregister` when closed; messages above the limit are sent without their photograph.
+
+        Before each message `check` is awaited, and its error ends the iterator.
+        """
         self._unregister = unregister
         self._max_message_bytes = max_message_bytes
+        self._check = check
         self._waiting: deque[_Watched] = deque(maxlen=QUEUE_LENGTH)
         self._missed_count = 0
         self._has_ended = False
@@ -62,6 +71,8 @@ class Watcher:
             await self._changed.wait()
         if self._has_ended:
             raise Unavailable("the server is stopping", reason="DRAINING", retry_after_s=1.0)
+        if self._check is not None:
+            await self._check()
         image, intrinsics, answer = self._waiting.popleft()
         missed, self._missed_count = self._missed_count, 0
         message = pb.WatchQueriesResponse(image=image, intrinsics=intrinsics, answer=answer, missed_count=missed)
@@ -124,13 +135,13 @@ class Watchers:
         if sum(counts.values()) >= MAX_WATCHERS or of_tenant >= MAX_WATCHERS_OF_TENANT:
             raise Overloaded("there are too many watchers", reason="TOO_MANY_WATCHERS", retry_after_s=5.0)
 
-    def watch(self, scene_key: SceneKey) -> Watcher:
-        """Makes a watcher of the scene's answers from now on, until it is closed.
+    def watch(self, scene_key: SceneKey, check: Check | None = None) -> Watcher:
+        """Makes a watcher of the scene's answers from now on, until it is closed; `check` as of `Watcher`.
 
         FailedPrecondition or Overloaded, see `check`.
         """
         self.check(tenant_of(scene_key))
-        watcher = Watcher(lambda it: self._unregister(scene_key, it), self._max_message_bytes)
+        watcher = Watcher(lambda it: self._unregister(scene_key, it), self._max_message_bytes, check)
         self.by_scene.setdefault(scene_key, set()).add(watcher)
         return watcher
 

@@ -5,16 +5,25 @@ reading the whole scene.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, insert, or_, select, update
 from sqlalchemy.dialects import sqlite
 
 from mapless.names import reference_name, scene_name
 from mapless_server.errors import AlreadyExists, NotFound
-from mapless_server.security import DEFAULT_TENANT, KEY_SEPARATOR, SceneKey, end_of_keys, key_of, scene_id_of
+from mapless_server.security import (
+    DEFAULT_TENANT,
+    KEY_SEPARATOR,
+    SceneKey,
+    SceneLimit,
+    end_of_keys,
+    key_of,
+    scene_id_of,
+    tenant_of,
+)
 
 from . import rows
 from .database import unless_damaged
@@ -51,16 +60,33 @@ def select_scenes() -> Select[Any]:
     )
 
 
-def select_scenes_of(tenant: str, after: str, labels: Mapping[str, str]) -> Select[Any]:
-    """The same columns for the scenes of a tenant with all these labels and ids greater than `after`, ordered by id."""
+def select_scenes_of(
+    tenant: str, after: str, labels: Mapping[str, str], limit: SceneLimit | None = None
+) -> Select[Any]:
+    """The same columns for the scenes of a tenant with all these labels and ids greater than `after`, ordered by id.
+
+    Only of those within the limit, if there is one.
+    """
     key = scene.c.scene_id
     # Not LIKE: to SQLite, "acme/%" is "ACME/%".
     is_theirs = ~key.contains(KEY_SEPARATOR) if tenant == DEFAULT_TENANT else key < end_of_keys(tenant)
-    found = select_scenes().where(key > key_of(tenant, after), is_theirs)
-    for name, value in labels.items():
-        label = scene_label.c
-        found = found.where(key.in_(select(label.scene_id).where(label.name == name, label.value == value)))
-    return found.order_by(key)
+    found = select_scenes().where(key > key_of(tenant, after), is_theirs, *have_labels(labels.items()))
+    return (found if limit is None else found.where(is_within(limit, tenant))).order_by(key)
+
+
+def have_labels(labels: Iterable[tuple[str, str]]) -> list[ColumnElement[bool]]:
+    """Conditions that rows of `scene` have each of these labels."""
+    label = scene_label.c
+    return [
+        scene.c.scene_id.in_(select(label.scene_id).where(label.name == name, label.value == value))
+        for name, value in sorted(labels)
+    ]
+
+
+def is_within(limit: SceneLimit, tenant: str) -> ColumnElement[bool]:
+    """Whether rows of `scene`, which are a tenant's, are within a limit."""
+    is_named = scene.c.scene_id.in_([key_of(tenant, it) for it in sorted(limit.scene_ids)])
+    return or_(is_named, and_(*have_labels(limit.labels))) if limit.labels else is_named
 
 
 def read_scenes(connection: Connection, found: Sequence[Row[Any]]) -> list[SceneRecord]:
@@ -80,9 +106,12 @@ def replace_labels(connection: Connection, scene_key: SceneKey, labels: Mapping[
         connection.execute(insert(scene_label), added)
 
 
-def find_scene(connection: Connection, scene_key: SceneKey) -> Row[Any]:
-    """The row of `select_scenes` for one scene; raises NotFound."""
-    return _one(connection, select_scenes().where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
+def find_scene(connection: Connection, scene_key: SceneKey, limit: SceneLimit | None = None) -> Row[Any]:
+    """The row of `select_scenes` for one scene; raises NotFound, also for one that is not within the limit."""
+    found = select_scenes().where(scene.c.scene_id == scene_key)
+    if limit is not None:
+        found = found.where(is_within(limit, tenant_of(scene_key)))
+    return _one(connection, found, lambda: _scene_not_found(scene_key))
 
 
 def find_calibrations(connection: Connection, scene_key: SceneKey) -> Sequence[Row[Any]]:

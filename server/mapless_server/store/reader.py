@@ -175,18 +175,6 @@ class StoreReader:
         return scene
 
     @observed
-    def list_scenes(
-        self, tenant: str, limit: int, after: str = "", labels: Mapping[str, str] = NO_LABELS
-    ) -> list[SceneRecord]:
-        """At most `limit` scenes of a tenant with all these labels, ordered by id, with ids greater than `after`.
-
-        DataLoss if the attributes of one of them are damaged.
-        """
-        page = queries.select_scenes_of(tenant, after, labels).limit(limit)
-        with self.database.read() as connection:
-            return queries.read_scenes(connection, connection.execute(page).all())
-
-    @observed
     def has_features(self, key: str, extractor: str) -> bool:
         """Whether a reference has features of this extractor; False if it was deleted."""
         with self.database.read() as connection:

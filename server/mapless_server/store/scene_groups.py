@@ -3,14 +3,14 @@
 Each look-up is one statement. Where only this process writes, it is executed again only after a change.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 from sqlalchemy import Row, Select
 
 from mapless_server.cache import LruCache
-from mapless_server.security import SceneKey
+from mapless_server.security import SceneKey, SceneLimit, key_of
 
 from . import queries, rows
 from .database import Database
@@ -42,10 +42,14 @@ class SceneGroups:
         # The latest group stays however large it is: each query of a tenant may search all of its scenes.
         self._found: LruCache[tuple[object, tuple[GroupedScene, ...]]] = LruCache(cache_bytes, cache_bytes > 0)
 
-    def find(self, tenant: str, labels: Mapping[str, str], state: object) -> tuple[GroupedScene, ...]:
-        """Scenes of a tenant with all these labels, ordered by id."""
+    def find(
+        self, tenant: str, labels: Mapping[str, str], limit: SceneLimit | None, state: object
+    ) -> tuple[GroupedScene, ...]:
+        """Scenes of a tenant with all these labels, within the limit if there is one; ordered by id."""
         return self._look_up(
-            (tenant, frozenset(labels.items())), lambda: queries.select_scenes_of(tenant, "", labels), state
+            (tenant, frozenset(labels.items()), limit),
+            lambda: queries.select_scenes_of(tenant, "", labels, limit),
+            state,
         )
 
     def find_named(self, keys: Sequence[SceneKey], state: object) -> NamedScenes:
@@ -61,6 +65,18 @@ class SceneGroups:
             tuple(by_key[it] for it in names if it in by_key), tuple(it for it in names if it not in by_key)
         )
 
+    def find_within(self, tenant: str, scene_ids: Collection[str], limit: SceneLimit, state: object) -> frozenset[str]:
+        """Those of some ids, at most `MAX_NAMED_SCENES`, whose scenes the limit names, or that have its labels."""
+        unnamed = frozenset(scene_ids) - limit.scene_ids
+        found: tuple[GroupedScene, ...] = ()
+        if unnamed and limit.labels:
+            keys = sorted(key_of(tenant, it) for it in unnamed)
+            are_within = (scene.c.scene_id.in_(keys), *queries.have_labels(limit.labels))
+            found = self._look_up(
+                (tuple(keys), limit.labels), lambda: queries.select_scenes().where(*are_within), state
+            )
+        return frozenset(scene_ids) - unnamed | {it.scene_id for it in found}
+
     def _look_up(self, name: Hashable, statement: Callable[[], Select[Any]], state: object) -> tuple[GroupedScene, ...]:
         before = self._found.get(name)
         if before is not None and before[0] is state and not self._database.is_shared:
@@ -70,7 +86,10 @@ class SceneGroups:
         with self._database.read() as connection:
             stored = connection.execute(wanted).all()
         found = tuple(_same_or_new(known.get(row.scene_id), row) for row in stored)
-        self._found.put(name, (state, found), SCENE_BYTES * (1 + len(found)))
+        if before is not None and found == before[1]:  # scenes are equal only to themselves
+            found = before[1]
+        if found:  # what is not there may be anything that a caller makes up
+            self._found.put(name, (state, found), SCENE_BYTES * (1 + len(found)))
         return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,7 +19,7 @@ from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
 from mapless_server.cache import LruCache
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound, Overloaded
 from mapless_server.method.features.views import View
-from mapless_server.security import SceneKey, scene_id_of
+from mapless_server.security import SceneKey, SceneLimit, scene_id_of
 
 from . import deletion, queries, rows, tables
 from .database import DamagedPages, Database, with_room_to_delete
@@ -115,12 +115,31 @@ class Store(StoreReader):
         self.close()
 
     @observed
-    def find_scenes(self, tenant: str, labels: Mapping[str, str] = NO_LABELS) -> tuple[GroupedScene, ...]:
-        """All scenes of a tenant with all these labels, ordered by id, at one moment.
+    def list_scenes(
+        self,
+        tenant: str,
+        count: int,
+        after: str = "",
+        labels: Mapping[str, str] = NO_LABELS,
+        limit: SceneLimit | None = None,
+    ) -> list[SceneRecord]:
+        """At most `count` scenes as of `find_scenes`, with ids greater than `after`.
+
+        DataLoss if the attributes of one of them are damaged.
+        """
+        page = queries.select_scenes_of(tenant, after, labels, limit).limit(count)
+        with self.database.read() as connection:
+            return queries.read_scenes(connection, connection.execute(page).all())
+
+    @observed
+    def find_scenes(
+        self, tenant: str, labels: Mapping[str, str] = NO_LABELS, limit: SceneLimit | None = None
+    ) -> tuple[GroupedScene, ...]:
+        """All scenes of a tenant with all these labels, within the limit if there is one; ordered by id, at one moment.
 
         Where only this process writes, the database is asked only after a change.
         """
-        return self._groups.find(tenant, labels, self._state)
+        return self._groups.find(tenant, labels, limit, self._state)
 
     @observed
     def find_scenes_named(self, scene_keys: Sequence[SceneKey]) -> NamedScenes:
@@ -129,6 +148,11 @@ class Store(StoreReader):
         Cached as of `find_scenes`. ValueError for more keys, or one that occurs twice.
         """
         return self._groups.find_named(scene_keys, self._state)
+
+    @observed
+    def find_within(self, tenant: str, scene_ids: Collection[str], limit: SceneLimit) -> frozenset[str]:
+        """The ids of up to 64 that the limit names, or whose scenes have its labels; cached as of `find_scenes`."""
+        return self._groups.find_within(tenant, scene_ids, limit, self._state)
 
     @observed
     def create_scene(
@@ -160,6 +184,7 @@ class Store(StoreReader):
         calibration: Calibration | UnchangedType | None = UNCHANGED,
         arbitrary_unit: bool | UnchangedType = UNCHANGED,
         labels: Mapping[str, str] | UnchangedType = UNCHANGED,
+        limit: SceneLimit | None = None,
     ) -> SceneRecord:
         """Changes attributes of a scene, and all of its labels together; None deletes an attribute.
 
@@ -167,7 +192,7 @@ class Store(StoreReader):
         Damaged attributes are replaced if datum, down_in_world and calibration are given; then the unit is the metre
         unless it is given. NotFound if there is no such scene; DataLoss if an attribute that is not given is damaged;
         ContradictingDown if datum and down_in_world do not belong to the same world; DatumWithoutMetres if there would
-        be a datum, and an arbitrary unit.
+        be a datum, and an arbitrary unit. A scene that is not within the limit, if there is one, is not there.
         """
         if isinstance(calibration, Calibration):
             calibration = replace(calibration, create_time=_now())
@@ -180,7 +205,7 @@ class Store(StoreReader):
                 queries.begin_change(connection, scene_key)
             else:
                 queries.lock_changes(connection, scene_key)
-            stored, found = queries.find_scene(connection, scene_key), NO_ATTRIBUTES
+            stored, found = queries.find_scene(connection, scene_key, limit), NO_ATTRIBUTES
             try:
                 found = rows.scene_attributes(stored)
             except DataLoss:

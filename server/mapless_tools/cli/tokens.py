@@ -1,8 +1,9 @@
 """`mapless-server token`: create, list, revoke. A new token is printed alone, for programs, or written to a file."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +17,8 @@ token_app = typer.Typer(help="Tokens that callers must have: create, list and re
 
 DEFAULT_TENANT = "default"
 """The default of `mapless_server.security`, whose import takes too long for --help; a test compares."""
+_NAMED = 5
+"""Scenes of a token that are shown in a line; JSON has all of them."""
 TokensFile = Annotated[Path | None, typer.Option(help="The file of tokens; default: the server's setting.")]
 
 
@@ -29,31 +32,44 @@ def create_command(
     name: Name = None,
     name_flag: NameFlag = None,
     tenant: Annotated[str, typer.Option(help="Tenant whose scenes the holder can access.")] = DEFAULT_TENANT,
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(help="Id of a scene that it is for; may be repeated; default: all of the tenant."),
+    ] = None,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=VALUE: it is for the scenes with this label, too; if repeated, with all of them."),
+    ] = None,
     expires: Annotated[str | None, typer.Option(help="When it ends, 2027-01-01T00:00:00Z; default: never.")] = None,
     tokens_file: TokensFile = None,
     output: Annotated[
         Path | None, typer.Option(help="New file for the token, which its owner alone can read; default: print it.")
     ] = None,
 ) -> None:
-    """Create a token and write or print it, once: the file of tokens has only its hash."""
+    """Create a token and write or print it, once: the file of tokens has only its hash.
+
+    With --scene or --label other scenes of the tenant do not exist for its holder.
+    """
     from mapless_server.security import create_token, written_secret
 
     name = _one_name(name, name_flag)
+    labels = _labels(label or []) or None
     with _tokens_file(tokens_file) as path:
         ends = _read_time(expires) if expires else None
+        create = partial(create_token, path, name, tenant, role, ends, scenes=scene or None, labels=labels)
         if output is not None:
             with written_secret(output) as file:
-                file.write(create_token(path, name, tenant, role, ends) + "\n")
+                file.write(create() + "\n")
             typer.echo(f"the token {name!r} of tenant {tenant!r} is in {output}", err=True)
             return
-        token = create_token(path, name, tenant, role, ends)
+        token = create()
     typer.echo(f"the token {name!r} of tenant {tenant!r}; it is not shown again:", err=True)
     print(token)
 
 
 @token_app.command("list")
 def list_command(tokens_file: TokensFile = None, as_json: AsJson = None) -> None:
-    """Show all tokens with their roles, tenants and expiry."""
+    """Show all tokens with their roles, tenants, expiry, and the scenes that they are limited to."""
     from mapless_server.security import read_tokens
 
     with _tokens_file(tokens_file) as path:
@@ -66,7 +82,7 @@ def list_command(tokens_file: TokensFile = None, as_json: AsJson = None) -> None
         end = "never expires"
         if it.expires is not None:
             end = f"{'expired' if it.expires <= now else 'expires'} {it.expires.isoformat()}"
-        print(f"{it.name:<{width}}  {it.role:<8}  tenant {it.tenant}  {end}")
+        print(f"{it.name:<{width}}  {it.role:<8}  tenant {it.tenant}  {end}{_limit(it.scenes or (), it.labels or {})}")
 
 
 @token_app.command("revoke")
@@ -101,6 +117,27 @@ def _tokens_file(given: Path | None) -> Iterator[Path]:
         fail(str(error))
     except SecurityError as error:
         fail(str(error), code=1)
+
+
+def _limit(scenes: Sequence[str], labels: Mapping[str, str]) -> str:
+    """The scenes that a token is limited to, in words; empty for all."""
+    words = [", ".join(scenes[:_NAMED])] if scenes else []
+    if len(scenes) > _NAMED:
+        words.append(f"{len(scenes) - _NAMED} more")
+    if labels:
+        words.append(f"scenes with {', '.join(f'{name}={value}' for name, value in labels.items())}")
+    return f"  only {' and '.join(words)}" if words else ""
+
+
+def _labels(texts: list[str]) -> dict[str, str]:
+    labels = dict[str, str]()
+    for text in texts:
+        name, separator, value = text.partition("=")
+        if not separator:
+            fail(f"--label takes NAME=VALUE, not {text!r}")
+        if labels.setdefault(name, value) != value:
+            fail(f"--label {name} is given as {labels[name]!r} and as {value!r}: no scene has both")
+    return labels
 
 
 def _read_time(text: str) -> datetime:

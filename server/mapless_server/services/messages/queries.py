@@ -33,12 +33,6 @@ def scene_key_from_name(name: str, field: str, tenant: str) -> SceneKey:
     return key_of(tenant, wire.scene_id_from_name(name, field))
 
 
-def reference_key_from_name(name: str, field: str, tenant: str) -> tuple[SceneKey, str]:
-    """The key of a tenant's scene, and a reference's id within it; FieldError if the name is not a reference's."""
-    scene_id, reference_id = wire.reference_ids_from_name(name, field)
-    return key_of(tenant, scene_id), reference_id
-
-
 def reference_ids_from_names(names_given: Sequence[str], scene_id: str, most: int) -> tuple[str, ...]:
     """Ids of the references in a request's `references`, in order.
 

@@ -2,14 +2,13 @@
 
 import base64
 import binascii
-import re
-import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
 from mapless import names, wire
 from mapless.depth import implausible_median
+from mapless.labels import check_labels
 from mapless.provenance import GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
 from mapless.scenes import (
     Calibration,
@@ -29,8 +28,6 @@ from .enums import message_of
 
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000
-MAX_LABELS, MAX_LABEL_VALUE = 32, 128
-_LABEL_NAME = re.compile("[A-Za-z0-9._-]{1,64}")
 
 Record = TypeVar("Record")
 
@@ -191,15 +188,10 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
 
 def labels_from_message(labels: Mapping[str, str], field: str) -> dict[str, str]:
     """Reads the labels of a scene, or those that scenes shall have; FieldError names a wrong one."""
-    if len(labels) > MAX_LABELS:
-        raise FieldError(field, f"must have at most {MAX_LABELS} labels, has {len(labels)}")
-    for name, value in labels.items():
-        if not _LABEL_NAME.fullmatch(name):
-            raise FieldError(field, f"must have names of 1 to 64 of A-Z a-z 0-9 . _ -, has {names.shown(name)}")
-        if not 1 <= len(value) <= MAX_LABEL_VALUE or any(unicodedata.category(it) == "Cc" for it in value):
-            bounds = f"1 to {MAX_LABEL_VALUE} characters, none of them a control character"
-            raise FieldError(field, f"must have values of {bounds}, {name!r} has {names.shown(value)}")
-    return dict(labels)
+    try:
+        return check_labels(labels)
+    except ValueError as error:
+        raise FieldError(field, str(error)) from None
 
 
 def changes_from_message(request: pb.UpdateSceneRequest) -> dict[str, Any]:

@@ -1,0 +1,23 @@
+"""Labels of scenes, by which they are grouped: value by name."""
+
+import re
+import unicodedata
+from collections.abc import Mapping
+
+from . import names
+
+MAX_LABELS, MAX_LABEL_VALUE = 32, 128
+_NAME = re.compile("[A-Za-z0-9._-]{1,64}")
+
+
+def check_labels(labels: Mapping[str, str]) -> dict[str, str]:
+    """The labels, unchanged; ValueError for too many, or one whose name or value breaks the rules."""
+    if len(labels) > MAX_LABELS:
+        raise ValueError(f"must have at most {MAX_LABELS} labels, has {len(labels)}")
+    for name, value in labels.items():
+        if not _NAME.fullmatch(name):
+            raise ValueError(f"must have names of 1 to 64 of A-Z a-z 0-9 . _ -, has {names.shown(name)}")
+        if not 1 <= len(value) <= MAX_LABEL_VALUE or any(unicodedata.category(it) == "Cc" for it in value):
+            bounds = f"1 to {MAX_LABEL_VALUE} characters, none of them a control character"
+            raise ValueError(f"must have values of {bounds}, {name!r} has {names.shown(value)}")
+    return dict(labels)
