@@ -22,11 +22,9 @@ from .answers import (
     FramedPose,
     Hint,
     Hypothesis,
-    IntrinsicsCheck,
     LocalizationResult,
     PriorCheck,
     Rejected,
-    UsedIntrinsics,
 )
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
@@ -40,6 +38,7 @@ from .diagnostics import (
     MissingEvidence,
     ReferenceUse,
     ScaleEstimate,
+    SceneUse,
 )
 from .errors import (
     AlreadyExists,
@@ -75,6 +74,7 @@ from .requests import IntrinsicsUncertainty, NewReference, ReadoutDirection
 from .results import Coverage, PendingWork, Reference, ReferenceAudit, RetrievedReference, Scene
 from .scenes import UNCHANGED, Calibration
 from .shortcut import localize
+from .used_intrinsics import IntrinsicsCheck, UsedIntrinsics
 
 __all__ = [
     "UNCHANGED",
@@ -139,6 +139,7 @@ __all__ = [
     "RigidTransform",
     "ScaleEstimate",
     "Scene",
+    "SceneUse",
     "SequenceFrame",
     "SequenceLocalization",
     "Similarity",

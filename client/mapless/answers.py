@@ -5,13 +5,12 @@ from datetime import datetime
 
 from .diagnostics import Debug, Diagnostics, summary_of_missing
 from .geodesy import GeoPose
-from .geometry import Array, Camera, RigidTransform
+from .geometry import Array, RigidTransform
+from .used_intrinsics import IntrinsicsCheck, UsedIntrinsics
 
 DOUBTFUL_TRUST = 0.15
 """Below it, an answer looks worse than 17 of 20 right ones of difficult places: the intrinsics may be wrong."""
 
-_FIELDS = {"FOCAL_LENGTH": "focal_x_px", "PRINCIPAL_X": "principal_x_px", "PRINCIPAL_Y": "principal_y_px", "K1": "k1"}
-"""Fields of CameraIntrinsics by the names that rejections give their parameters."""
 _CAPTURED = "captured by the server"
 
 
@@ -101,70 +100,6 @@ class PriorCheck:
         return f"{self.kind} agrees, " + ("used" if self.used else "less certain than the photograph, not needed")
 
 
-@dataclass(frozen=True)
-class IntrinsicsCheck:
-    """Comparison of one intrinsic parameter with the value that the photograph's matches give.
-
-    Attributes:
-        parameter: "FOCAL_LENGTH" (along x), "PRINCIPAL_X", "PRINCIPAL_Y" or "K1".
-        given: its value in the request; pixels of the photograph, no unit for K1.
-        estimated: its value estimated from the photograph alone.
-        estimated_sigma: standard deviation of the estimated value.
-        given_sigma: standard deviation of the given value.
-        conflict: whether they differ by more than both allow; the answer is then a rejection.
-        used: whether the pose was computed with the estimated value.
-    """
-
-    parameter: str
-    given: float
-    estimated: float
-    estimated_sigma: float
-    given_sigma: float
-    conflict: bool
-    used: bool
-
-    @property
-    def differs(self) -> bool:
-        """Whether the photograph's value was used, and differs from the given one by more than its usual error."""
-        return self.used and abs(self.estimated - self.given) > self.given_sigma
-
-    def __str__(self) -> str:
-        name = _FIELDS.get(self.parameter, self.parameter)
-        digits = 3 if self.parameter == "K1" else 1
-        return (
-            f"{name} is {self.given:.{digits}f}, the photograph says {self.estimated:.{digits}f} +- "
-            f"{self.estimated_sigma:.{digits}f}{': used' if self.used else ''}"
-        )
-
-
-@dataclass(frozen=True)
-class UsedIntrinsics:
-    """The intrinsics that a photograph was read with.
-
-    Attributes:
-        camera: in pixels of the photograph; where the photograph says better than what was given or chosen, that.
-        source: "GIVEN"; "SCENE_CAMERA", of references; "EXIF", the focal length in the photograph's; or "ESTIMATED"
-            from its matches.
-        focal_sigma_px: standard deviation of the focal length along x.
-    """
-
-    camera: Camera
-    source: str
-    focal_sigma_px: float
-
-    def __str__(self) -> str:
-        source = _SOURCES.get(self.source, self.source)
-        return f"focal length {self.camera.focal_x_px:.1f} +- {self.focal_sigma_px:.1f} px, {source}"
-
-
-_SOURCES = {
-    "GIVEN": "as given",
-    "SCENE_CAMERA": "of the references' camera",
-    "EXIF": "by the photograph's EXIF",
-    "ESTIMATED": "estimated from the photograph",
-}
-
-
 POINT_SOURCES = {
     "TRIANGULATED": "triangulated",
     "MEASURED_DEPTH": "by measured depth",
@@ -202,6 +137,7 @@ class Hypothesis:
         references: names of the references that support it.
         covariance, accuracy: as of `LocalizationResult`, of a pose that is rejected for its radius alone; else None.
         arbitrary_unit, in_axes, geo_pose: likewise.
+        scene: name of the scene in whose world it is; the two of an ambiguous photograph may be in two scenes.
     """
 
     world_from_camera: RigidTransform
@@ -212,6 +148,7 @@ class Hypothesis:
     arbitrary_unit: bool = False
     in_axes: FramedPose | None = None
     geo_pose: GeoPose | None = None
+    scene: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +175,8 @@ class LocalizationResult:
         debug: the matches that support it, if requested.
         capture_time, session_from_camera: as they were sent.
         is_final: False only for answers of `localize_progressively` which another one follows.
+        scene: name of the scene in whose world it is; of several, the one that was found. Empty from servers before
+            0.4.
     """
 
     world_from_camera: RigidTransform
@@ -260,6 +199,7 @@ class LocalizationResult:
     scale_source: str = "REFERENCES"
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
     used_intrinsics: UsedIntrinsics | None = None
+    scene: str = ""
 
     @property
     def world_from_session(self) -> RigidTransform | None:
@@ -274,7 +214,8 @@ class LocalizationResult:
         pose, frame = self.world_from_camera, ""
         if self.in_axes is not None and self.in_axes.axes != "OPENCV":
             pose, frame = self.in_axes.world_from_camera, f"   in {self.in_axes.axes} axes"
-        text = [f"{_outcome(self)}{frame}", *pose_lines(pose, self.accuracy, self.arbitrary_unit)]
+        scene = f" in {_id(self.scene)}" if self.diagnostics.is_among_several else ""
+        text = [f"{_outcome(self, scene)}{frame}", *pose_lines(pose, self.accuracy, self.arbitrary_unit)]
         if self.geo_pose is not None:
             geo = self.geo_pose
             text.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
@@ -316,6 +257,8 @@ class Rejected:
         used_intrinsics: the intrinsics that it was read with; None if none were given and none found.
         debug: the matches, if requested and found.
         capture_time, session_from_camera: as they were sent.
+        scene: name of the scene in whose world the poses are; of several, the one whose references matched best. Empty
+            if none of several has a reference, and from servers before 0.4.
         is_final: always True.
     """
 
@@ -329,10 +272,15 @@ class Rejected:
     intrinsics_checks: tuple[IntrinsicsCheck, ...] = ()
     debug: Debug | None = None
     used_intrinsics: UsedIntrinsics | None = None
+    scene: str = ""
     is_final: bool = field(default=True, init=False)
 
     def __str__(self) -> str:
         text = [rejection_text(self.reason, self.message, self.hint)]
+        if self.diagnostics.is_among_several and len({it.scene for it in self.hypotheses}) > 1:
+            text.append(f"  it may be in {' or '.join(_id(it.scene) for it in self.hypotheses)}")
+        elif self.diagnostics.is_among_several and self.scene:
+            text.append(f"  of {self.diagnostics.searched_scene_count} scenes, {_id(self.scene)} matched best")
         text += [f"  read with a {it}" for it in _chosen(self.used_intrinsics)]
         for it in (it for it in self.hypotheses if it.accuracy is not None):
             pose, frame = it.world_from_camera, ""
@@ -358,7 +306,7 @@ def rejection_text(reason: str, message: str, hint: Hint | None) -> str:
     if hint is not None and hint.message:
         text.append(f"  {hint.message}")
     if hint is not None and hint.best_reference:
-        text.append(f"  shares most with reference {hint.best_reference.rpartition('/')[2]}")
+        text.append(f"  shares most with reference {_id(hint.best_reference)}")
     return "\n".join(text)
 
 
@@ -378,11 +326,17 @@ def _chosen(used: UsedIntrinsics | None) -> list[UsedIntrinsics]:
     return [] if used is None or used.source == "GIVEN" else [used]
 
 
-def _outcome(answer: LocalizationResult) -> str:
+def _outcome(answer: LocalizationResult, scene: str) -> str:
     follows = "" if answer.is_final else "; the final answer follows"
     if answer.pose_stage == "COARSE":
-        return f"coarse pose{follows}"
-    return f"localized{follows}" if answer.trust is None else f"localized, trust {answer.trust:.3f}{follows}"
+        return f"coarse pose{scene}{follows}"
+    trust = "" if answer.trust is None else f", trust {answer.trust:.3f}"
+    return f"localized{scene}{trust}{follows}"
+
+
+def _id(name: str) -> str:
+    """The id of a scene or reference."""
+    return name.rpartition("/")[2]
 
 
 def _support(answer: LocalizationResult) -> str:

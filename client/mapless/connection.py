@@ -34,20 +34,17 @@ from typing import Any, TypeVar
 import grpc
 from google.protobuf.message import Message
 
-from . import names
 from .addresses import addresses_of
 from .errors import DeadlineExceeded, Internal, MaplessError, from_rpc_error, is_misconfigured, is_unconnected
 from .masks import IgnoredMask, carries_mask
 from .options import ConnectOptions
 from .reaching import explained
+from .routing import scene_metadata
 from .servers import Server, Servers
 from .wire import FieldError
 
-SCENE_KEY = "x-mapless-scene"
 VERSION_KEY = "x-mapless-version"
 """In the trailers of servers since 0.3.0."""
-_FIELDS = ("scene", "name", "scene_id")
-"""Fields of requests that contain it: the scene's name, the name of a scene or reference, or the id of a new scene."""
 
 T = TypeVar("T")
 ItemT = TypeVar("ItemT")
@@ -67,29 +64,6 @@ _FEW_ATTEMPTS = 4
 """After so many, in about 1.4 s, it is examined why no connection is made; what is wrong with certificates or protocol,
 and the answer of a health check, are not waited for any longer."""
 _LATENESS = 0.25  # relative, added to the server's RetryInfo at random: many refused clients retry, but none earlier
-
-
-def scene_metadata(request: Message) -> tuple[tuple[str, str], ...]:
-    """("x-mapless-scene", "scenes/{scene}") of a request that concerns one scene, for load balancers; else empty.
-
-    Also empty for an invalid name, which may be unfit for metadata and which the server reports. A valid name is
-    visible ASCII of at most 135 bytes.
-    """
-    descriptor: Any = request.DESCRIPTOR
-    name_field = next((field for field in _FIELDS if field in descriptor.fields_by_name), None)
-    if name_field is None:
-        return ()
-    value = getattr(request, name_field)
-    if isinstance(value, Message):  # the scene itself
-        value = getattr(value, "name", "")
-    try:
-        if name_field == "scene_id":
-            return ((SCENE_KEY, names.scene_name(names.check_id(value))),)
-        is_reference = "/references/" in value
-        scene_id = names.parse_reference_name(value)[0] if is_reference else names.parse_scene_name(value)
-    except ValueError:
-        return ()
-    return ((SCENE_KEY, names.scene_name(scene_id)),)
 
 
 class Connection:

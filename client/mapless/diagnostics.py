@@ -24,6 +24,25 @@ class ReferenceUse:
 
 
 @dataclass(frozen=True)
+class SceneUse:
+    """One of several scenes, as far as the photograph resembles its references.
+
+    Attributes:
+        scene: its name.
+        reference_count: its references among those of all scenes that resemble the photograph most.
+        similarity: largest similarity of one of them, as of `ReferenceUse`.
+        match_count: most matches of the photograph with one of them.
+        attempted: whether a pose was looked for in it.
+    """
+
+    scene: str
+    reference_count: int
+    similarity: float
+    match_count: int
+    attempted: bool
+
+
+@dataclass(frozen=True)
 class ScaleEstimate:
     """The reconstruction's metric scale.
 
@@ -208,6 +227,8 @@ class Diagnostics:
         missing_evidence: what references lacked for further attempts; asking again later may help.
         depth_check: how the photograph's depth compares with the answer; None without depth, and of a server before
             0.4, which ignores it.
+        scenes: of several scenes, those with references that resemble the photograph most, the best first.
+        searched_scene_count: number of scenes in which references were looked for; 0 of a server before 0.4.
     """
 
     request_id: str
@@ -232,6 +253,13 @@ class Diagnostics:
     ladder_cuts: tuple[LadderCut, ...] = ()
     depth_check: DepthCheck | None = None
     missing_evidence: tuple[MissingEvidence, ...] = ()
+    scenes: tuple[SceneUse, ...] = ()
+    searched_scene_count: int = 0
+
+    @property
+    def is_among_several(self) -> bool:
+        """Whether the scene was found among several."""
+        return self.searched_scene_count > 1
 
     @property
     def is_tracked(self) -> bool:

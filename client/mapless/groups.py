@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from .answers import Accuracy, Hint, Hypothesis, PriorCheck, UsedIntrinsics, pose_lines, rejection_text
+from .answers import Accuracy, Hint, Hypothesis, PriorCheck, pose_lines, rejection_text
 from .axes import Axes, pose_to
 from .depth import DepthImage
 from .diagnostics import Diagnostics
@@ -11,6 +11,7 @@ from .geodesy import GeoPose
 from .geometry import Array, Camera, RigidTransform, Similarity
 from .priors import Priors
 from .requests import ImageSource, IntrinsicsUncertainty
+from .used_intrinsics import UsedIntrinsics
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 import numpy as np
 
 from . import names, wire
-from .answers import Accuracy, Hypothesis, LocalizationResult, Rejected, UsedIntrinsics
+from .answers import Accuracy, Hypothesis, LocalizationResult, Rejected
 from .depth import DepthImage, depth_from_message
 from .diagnostics import Attempt, Debug, Diagnostics
 from .geodesy import Datum, GeoPose
@@ -23,6 +23,7 @@ from .groups import GroupRejected, ImageReport, RigLocalization, SequenceLocaliz
 from .provenance import Provenance, provenance_from_message
 from .results import PendingWork, Reference, Scene
 from .scenes import Calibration, Vector, calibration_from_message, datum_from_message, direction_from_message
+from .used_intrinsics import UsedIntrinsics
 from .v1 import localization_service_pb2 as pb
 from .v1 import reference_service_pb2 as reference_pb
 

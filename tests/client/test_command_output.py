@@ -10,7 +10,7 @@ import pytest
 from support.planted_answers import diagnostics, localized, rejected, truth
 
 from mapless import wire
-from mapless.answers import Accuracy, IntrinsicsCheck, LocalizationResult, PriorCheck, Rejected
+from mapless.answers import Accuracy, LocalizationResult, PriorCheck, Rejected
 from mapless.axes import Axes, pose_to
 from mapless.cameras import read_camera
 from mapless.cli.arguments import make_parser
@@ -23,6 +23,7 @@ from mapless.lenses import Fisheye
 from mapless.priors import Priors
 from mapless.requests import read_image
 from mapless.results import PendingWork, summary_of
+from mapless.used_intrinsics import IntrinsicsCheck
 from mapless.v1 import localization_service_pb2 as pb
 
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from support.clients import Connect, Recording, awaiting, hosted
 
 from mapless import Client, ConnectOptions, names
-from mapless.connection import SCENE_KEY, scene_metadata
 from mapless.errors import MaplessError
+from mapless.routing import SCENE_KEY, scene_metadata
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as reference_pb
 

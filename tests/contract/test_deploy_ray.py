@@ -14,7 +14,7 @@ from ray.serve._private import constants
 from ray.serve.config import AutoscalingConfig
 from ray.serve.schema import ServeDeploySchema
 
-from mapless.connection import SCENE_KEY
+from mapless.routing import SCENE_KEY
 from mapless_ray.app import DRAIN_GRACE_S, build
 from mapless_ray.environment import variables
 from mapless_server.settings import load_settings

@@ -1,7 +1,7 @@
 """Localization of one photograph, of a rig's photographs, and of a sequence."""
 
 import warnings
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import aclosing
 from dataclasses import asdict, replace
 from datetime import datetime
@@ -16,7 +16,7 @@ from ..depth import DepthImage, IgnoredDepth, depth_to_message
 from ..geometry import Camera, RigidTransform
 from ..groups import GroupRejected, ImageReport, RigImage, RigLocalization, SequenceFrame, SequenceLocalization
 from ..messages import answer_from_message, rig_from_message, sequence_from_message
-from ..names import reference_names, scene_name
+from ..names import reference_names, scene_name, shown
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, IntrinsicsUncertainty, read_image, read_mask
 from ..v1 import localization_service_pb2 as pb
@@ -33,6 +33,9 @@ async def _localize_request(
     scene: str = "",
     references: Sequence[str] = (),
     *,
+    scenes: Sequence[str] = (),
+    group: Mapping[str, str] | None = None,
+    prior_scene: str = "",
     priors: Priors | None = None,
     intrinsics_uncertainty: IntrinsicsUncertainty | None = None,
     variant: str = "",
@@ -62,8 +65,12 @@ async def _localize_request(
         camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation; None if it is
             not known: the server then takes that of references with the same EXIF, the focal length in the file's EXIF,
             or the camera of references with the same sides, or estimates it (`LocalizationResult.used_intrinsics`).
-        scene: the scene to localize in.
+        scene: the scene to localize in. Exactly one of this, `scenes` and `group` is required.
         references: the references to use, most similar first, at most 64; empty: the server chooses.
+        scenes: up to 64 scenes, among which the server finds that of the photograph: `answer.scene`.
+        group: labels by name that such scenes have, {"site": "a"}; {} for all scenes that the caller may read.
+        prior_scene: with `scenes` or `group`, the one of them in whose world position, heading, pose and down_in_world
+            of `priors` are given; the scene of the last answer, if the prior comes from it.
         priors: knowledge of the pose before the photograph is used, for example its position.
         intrinsics_uncertainty: standard deviations of the camera's intrinsics, and the read-out of a rolling shutter;
             None for the defaults, which are smaller where the references have the same camera, and a global shutter.
@@ -91,10 +98,7 @@ async def _localize_request(
             `Diagnostics.depth_check` says how it compares with the answer.
         timeout_s: deadline of the call.
     """
-    scene = scene_name(scene)
     request = pb.LocalizeRequest(
-        scene=scene,
-        references=reference_names(scene, references),
         image=await connection.unblocked(read_image, image),
         mask=await connection.unblocked(read_mask, mask),
         intrinsics=None if camera is None else wire.camera_to_message(camera),
@@ -113,6 +117,9 @@ async def _localize_request(
             confidential=confidential,
         ),
     )
+    _set_scenes(request, scene, scenes, group, prior_scene)
+    if references:
+        request.references.extend(reference_names(scene, references))
     set_priors(request, priors or Priors())
     if intrinsics_uncertainty is not None:
         uncertainty = _uncertainty_to_message(intrinsics_uncertainty, "intrinsics_uncertainty")
@@ -122,6 +129,29 @@ async def _localize_request(
     if session_from_camera is not None:
         request.session_from_camera.CopyFrom(wire.transform_to_message(session_from_camera, "session_from_camera"))
     return request
+
+
+def _set_scenes(
+    request: pb.LocalizeRequest, scene: str, scenes: Sequence[str], group: Mapping[str, str] | None, prior_scene: str
+) -> None:
+    """Sets where the photograph may have been taken; ValueError unless exactly one of scene, scenes and group is."""
+    if isinstance(scenes, str):
+        raise TypeError(f"scenes must be a list of ids or names, is the text {shown(scenes)}")
+    ways = {"scene": scene, "scenes": scenes, "group": group is not None}
+    given = [name for name, value in ways.items() if value]
+    if len(given) > 1:
+        raise ValueError(f"{given[1]} must not be given together with {given[0]}")
+    if scenes:
+        request.scenes.extend(map(scene_name, scenes))
+    elif group is not None:
+        if not isinstance(group, Mapping):
+            raise TypeError(f"group must be labels by name, such as {{'site': 'a'}}, is {shown(repr(group))}")
+        request.scene_group.SetInParent()
+        request.scene_group.labels.update(group)
+    else:
+        request.scene = scene_name(scene)
+    if prior_scene:
+        request.prior_scene = scene_name(prior_scene)
 
 
 _localize_request.__qualname__ = "localize"  # by which Python names it where an argument is missing or unknown

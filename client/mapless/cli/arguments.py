@@ -11,7 +11,7 @@ from mapless_command.installation import how_to_install
 from ..client import Client
 from ..shortcut import default_address
 from . import commands, doctor
-from .parsing import COMMON_DEFAULTS, Command, Parser, add_common, all_parsers
+from .parsing import COMMON_DEFAULTS, Command, Parser, add_common, all_parsers, label
 from .photographs import COUNT_DEFAULT, MASK, add_depth, add_limits, add_localize, count
 
 DESCRIPTION = """\
@@ -128,15 +128,8 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
     listing.set_defaults(run=commands.list_scenes)
 
 
-def _label(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not (name and equals and value):
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, such as site=a")
-    return name, value
-
-
 def _add_labels(command: argparse.ArgumentParser, text: str) -> None:
-    command.add_argument("--label", action="append", default=[], type=_label, metavar="NAME=VALUE", help=text)
+    command.add_argument("--label", action="append", default=[], type=label, metavar="NAME=VALUE", help=text)
 
 
 def _add_place(command: argparse.ArgumentParser) -> None:

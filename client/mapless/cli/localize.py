@@ -45,6 +45,8 @@ def run(client: Client, arguments: argparse.Namespace) -> int:
         raise ValueError("--rerank needs --reference: it chooses among the references given")
     if arguments.parallel < 1:
         raise ValueError(f"--parallel must be at least 1, is {arguments.parallel}")
+    if arguments.reference and not arguments.scene:
+        raise ValueError("--reference needs SCENE: references are of one scene")
     if not arguments.photo.is_dir():
         return _one(client, arguments)
     if arguments.progressive:
@@ -86,7 +88,7 @@ def _folder(client: Client, arguments: argparse.Namespace) -> int:
     try:
         with _opened(arguments.output) as file, contextlib.closing(_all(client, photos, arguments)) as outcomes:
             if not as_json:
-                print(output.heading(width), file=file)
+                print(output.heading(width, not arguments.scene), file=file)
             tally.draw()
             for photo, outcome in zip(photos, outcomes, strict=True):
                 tally.clear()
@@ -220,6 +222,9 @@ def _answers(
 ) -> Iterator[LocalizationResult | Rejected]:
     """Yields the answer; with --progressive, others may come first."""
     options: dict[str, Any] = {
+        "scenes": arguments.scenes,
+        "group": dict(arguments.group) if arguments.group or arguments.anywhere else None,
+        "prior_scene": arguments.prior_scene,
         "priors": priors(arguments),
         "mask": mask,
         "depth": depth_of(arguments),
@@ -251,7 +256,7 @@ def _row(photo: Photo, width: int, outcome: Outcome, as_json: bool, arguments: a
         )
     if as_json:
         return json.dumps({"photo": photo.name} | _json(photo, outcome, arguments))
-    return output.line(f"{photo.name:{width}}", outcome)
+    return output.line(f"{photo.name:{width}}", outcome, not arguments.scene)
 
 
 def _json(photo: Photo, answer: LocalizationResult | Rejected, arguments: argparse.Namespace) -> dict[str, Any]:

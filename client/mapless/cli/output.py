@@ -108,8 +108,8 @@ def plain(value: Any) -> Any:
     return value
 
 
-def line(name: str, answer: LocalizationResult | Rejected) -> str:
-    """An answer as one row of a table."""
+def line(name: str, answer: LocalizationResult | Rejected, with_scene: bool = False) -> str:
+    """An answer as one row of a table, which ends with its scene if that is wanted."""
     if isinstance(answer, Rejected):
         return f"{name}  not localized: {answer.reason}"
     x, y, z = answer.world_from_camera.translation
@@ -119,12 +119,14 @@ def line(name: str, answer: LocalizationResult | Rejected) -> str:
         radius = f"{radius_m:11.4g}" if answer.arbitrary_unit else f"{100 * radius_m:8.2f} cm"
     trust = f"{answer.trust:6.3f}" if answer.trust is not None else " " * 6
     counts = f"{answer.inlier_count}/{answer.match_count}"
-    return f"{name}  {x:9.3f} {y:9.3f} {z:9.3f} {unit} {radius} {trust}  {counts:>9}"
+    scene = f"  {answer.scene.removeprefix('scenes/')}" if with_scene else ""
+    return f"{name}  {x:9.3f} {y:9.3f} {z:9.3f} {unit} {radius} {trust}  {counts:>9}{scene}"
 
 
-def heading(width: int) -> str:
+def heading(width: int, with_scene: bool = False) -> str:
     """Heading of the table of `line`, for names of this width."""
-    return f"{'photograph':{width}}  {'x':>9} {'y':>9} {'z':>9}    {'95 % within':>10} {'trust':>6}  {'inliers':>9}"
+    scene, numbers = "  scene" if with_scene else "", f"{'x':>9} {'y':>9} {'z':>9}   {'95 % within':>11} {'trust':>6}"
+    return f"{'photograph':{width}}  {numbers}  {'inliers':>9}{scene}"
 
 
 _MAX_COMPARED = 10_000

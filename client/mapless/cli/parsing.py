@@ -8,7 +8,7 @@ import itertools
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -73,11 +73,37 @@ class Gone(argparse.Action):
 
 
 class Command(Parser):
-    """A command, which also accepts the common flags; they override those given before the command."""
+    """A command, which also accepts the common flags; they override those given before the command.
+
+    With one of `instead_of_scene` among its flags, it takes no argument `scene`.
+    """
+
+    instead_of_scene: Sequence[str] = ()
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         add_common(self)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Decides, by the flags in front of "--", whether the argument `scene` is taken."""
+        if not self.instead_of_scene:
+            return super().parse_known_args(args, namespace)
+        flags = [it.partition("=")[0] for it in itertools.takewhile(lambda it: it != "--", args or ())]
+        instead = next((it for it in flags if it in self.instead_of_scene), "")
+        scene = next(it for it in self._actions if it.dest == "scene")
+        scene.nargs, scene.default = (argparse.SUPPRESS, "") if instead else (None, None)
+        namespace, left = super().parse_known_args(args, namespace)
+        if instead and left:
+            self.error(f"SCENE is not taken together with {instead}; left over: {' '.join(left)}")
+        return namespace, left
+
+
+def label(text: str) -> tuple[str, str]:
+    """Reads a label, NAME=VALUE."""
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, such as site=a")
+    return name, value
 
 
 def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:

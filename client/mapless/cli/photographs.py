@@ -10,7 +10,7 @@ from mapless_command.installation import how_to_install
 from ..depth import DepthSensor
 from ..requests import ReadoutDirection
 from . import localize
-from .parsing import Gone
+from .parsing import Command, Gone, label
 
 COUNT_DEFAULT = "(default: the server's)"
 
@@ -22,10 +22,11 @@ _DRAWING = (
 )
 
 
-def add_localize(command: argparse.ArgumentParser) -> None:
+def add_localize(command: Command) -> None:
     """Adds the flags that `localize.run` reads."""
-    command.add_argument("scene")
+    command.add_argument("scene", help="the scene; left out where flags say among which scenes it is found")
     command.add_argument("photo", type=Path, help="or a folder of photographs")
+    _add_scenes(command)
     command.add_argument(
         "--camera",
         help="the camera of the photographs, see `mapless --help` (default: those that the folder's cameras.json has; "
@@ -80,6 +81,33 @@ def add_localize(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     shown.add_argument("--draw", action=Gone, nargs="?", help=argparse.SUPPRESS, instead=_DRAWING)
     command.set_defaults(run=localize.run)
+
+
+def _add_scenes(command: Command) -> None:
+    """Adds the flags that say among which scenes that of a photograph is found."""
+    command.instead_of_scene = ("--scene", "--group", "--anywhere")
+    text = "in place of SCENE: among which scenes the server finds that of the photograph"
+    shown = command.add_argument_group("scenes", text)
+    several = shown.add_mutually_exclusive_group()
+    several.add_argument(
+        "--scene", dest="scenes", action="append", default=[], metavar="SCENE", help="one of them; may be repeated"
+    )
+    several.add_argument(
+        "--group", action="append", default=[], type=_group_label, metavar="NAME=VALUE",
+        help="those with this label, site=a, see `mapless scene update --label`; VALUE alone is group=VALUE; may be "
+        "repeated, for those with all of the labels",
+    )  # fmt: skip
+    several.add_argument("--anywhere", action="store_true", help="all scenes that the caller may read")
+    shown.add_argument(
+        "--prior-scene",
+        default="",
+        metavar="SCENE",
+        help="the one in whose world --near, --looking and --pose-prior are given",
+    )
+
+
+def _group_label(text: str) -> tuple[str, str]:
+    return label(text if "=" in text else f"group={text}")
 
 
 def count(text: str) -> int:

@@ -181,7 +181,7 @@ def rejection_to_message(rejection: Rejection, scene_key: SceneKey | None = None
 
 def _hypothesis_to_message(hypothesis: PoseHypothesis, scene_key: SceneKey | None) -> pb.Hypothesis:
     return pb.Hypothesis(
-        scene=scene_to_name(SceneKey(hypothesis.world) if hypothesis.world else scene_key),
+        scene=names.scene_name(hypothesis.world) if hypothesis.world else scene_to_name(scene_key),
         world_from_camera=wire.transform_to_message(hypothesis.world_from_camera),
         inlier_count=hypothesis.inlier_count,
         references=hypothesis.references,
