@@ -277,9 +277,7 @@ class Rejected:
 
     def __str__(self) -> str:
         text = [rejection_text(self.reason, self.message, self.hint)]
-        if self.diagnostics.is_among_several and len({it.scene for it in self.hypotheses}) > 1:
-            text.append(f"  it may be in {' or '.join(_id(it.scene) for it in self.hypotheses)}")
-        elif self.diagnostics.is_among_several and self.scene:
+        if self.diagnostics.is_among_several and self.scene and self.reason != "AMBIGUOUS":
             text.append(f"  of {self.diagnostics.searched_scene_count} scenes, {_id(self.scene)} matched best")
         text += [f"  read with a {it}" for it in _chosen(self.used_intrinsics)]
         for it in (it for it in self.hypotheses if it.accuracy is not None):

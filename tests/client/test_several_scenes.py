@@ -8,7 +8,6 @@ from support.planted_answers import diagnostics, localized, rejected, truth
 from support.servers import CAMERA, PHOTO
 
 from mapless import ConnectOptions, wire
-from mapless.answers import Hypothesis
 from mapless.calls.localization import localize
 from mapless.cli.arguments import make_parser
 from mapless.cli.output import heading, line
@@ -93,9 +92,6 @@ def test_text_names_the_scene_where_it_was_found() -> None:
     assert str(found).startswith("localized in yard, trust 0.400\n")
     assert str(localized(scene="scenes/yard", diagnostics=among(1))).startswith("localized, trust 0.400\n")
     assert "  of 12 scenes, yard matched best\n" in str(rejected(scene="scenes/yard", diagnostics=among(12))) + "\n"
-    places = tuple(Hypothesis(truth(), 30, (), scene=f"scenes/{it}") for it in ("yard", "hall"))
-    ambiguous = rejected(scene="scenes/yard", diagnostics=among(12), hypotheses=places)
-    assert "  it may be in yard or hall\n" in f"{ambiguous}\n"
 
 
 def test_the_table_of_a_folder_ends_with_scenes() -> None:

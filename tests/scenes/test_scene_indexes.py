@@ -16,7 +16,7 @@ from mapless_server.errors import DataLoss, NotFound
 from mapless_server.method.options import StageContext
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
-from mapless_server.security import SceneKey
+from mapless_server.security import DEFAULT_TENANT, SceneKey
 from mapless_server.store import NewReference, SceneChanges, Store
 
 SCENE = SceneKey("s")
@@ -55,6 +55,16 @@ def test_who_does_not_wait_gets_what_any_server_has_described(store: Store) -> N
     indexes.describe(SCENE, [("r2", records[2].key)], late)
     assert late.lacking == {("retrieval", DESCRIPTOR.name, records[2].key): False}
     assert store.get_generation(SCENE) == generation, "descriptors are no change of the scene"
+
+
+def test_how_far_references_reach_is_known_of_the_generation_that_was_read(store: Store) -> None:
+    store.add_references(SCENE, [new(i, is_described=True) for i in range(3)])
+    indexes, before = indexes_of(store), store.find_scenes(DEFAULT_TENANT)
+    assert indexes.extents_m(before).tolist() == [math.inf]
+    indexes.entries(SCENE, StageContext())
+    assert indexes.extents_m(before).tolist() == [np.linalg.norm(pose(2.0).translation)]
+    store.delete_reference(SCENE, "r2")
+    assert indexes.extents_m(store.find_scenes(DEFAULT_TENANT)).tolist() == [math.inf]
 
 
 class TestDamage:

@@ -9,7 +9,7 @@ import pytest
 from google.protobuf.json_format import ParseDict
 
 from mapless.geodesy import Datum, geodetic_from_world, geopose, pose_from_geopose
-from mapless.geometry import Quaternion, RigidTransform, rotation_from_vector
+from mapless.geometry import Array, Quaternion, RigidTransform, rotation_from_vector
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, transform_to_message
 from mapless_server.engine.query import SceneQuestion
@@ -53,7 +53,12 @@ def request(**fields: Any) -> pb.LocalizeRequest:
 
 
 def questions(scenes: FoundScenes, **fields: Any) -> Sequence[SceneQuestion]:
-    return questions_from_message(request(**fields), scenes, DEFAULT_TENANT)[0]
+    return questions_from_message(request(**fields), scenes, DEFAULT_TENANT, unknown)[0]
+
+
+def unknown(scenes: Sequence[GroupedScene]) -> Array:
+    """Extents of scenes that were not searched yet."""
+    return np.full(len(scenes), np.inf)
 
 
 WAYS = {"scene": "scenes/a", "scenes": ["scenes/a"], "scene_group": {}}
@@ -123,7 +128,7 @@ def test_a_pose_in_one_world_is_the_same_on_the_earth_in_another() -> None:
     sent = request(prior_scene="scenes/s0")
     sent.pose_prior.world_from_camera.CopyFrom(transform_to_message(POSE))
     sent.pose_prior.covariance.row_major.extend(COVARIANCE.ravel().tolist())
-    (here, there), prior_scene = questions_from_message(sent, found(HALL, YARD), DEFAULT_TENANT)
+    (here, there), prior_scene = questions_from_message(sent, found(HALL, YARD), DEFAULT_TENANT, unknown)
     assert prior_scene == "s0"
     assert here.priors.pose is not None
     assert there.priors.pose is not None
@@ -191,7 +196,7 @@ def test_scenes_beyond_a_geo_position_cost_no_conversion(monkeypatch: pytest.Mon
     kept, _ = questions_from_message(sent, scenes, DEFAULT_TENANT, lambda them: np.full(len(them), 100.0))
     assert [it.scene_key for it in kept] == ["s0", "s9998", "s9999"]
     assert len(converted) == 3
-    everywhere, _ = questions_from_message(sent, scenes, DEFAULT_TENANT, lambda them: np.full(len(them), np.inf))
+    everywhere, _ = questions_from_message(sent, scenes, DEFAULT_TENANT, unknown)
     assert len(everywhere) == 10_000
 
 

@@ -37,7 +37,9 @@ class LocalizationServiceStub(object):
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
-    in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
+    in front of several servers, which keep a scene's calls at one server by it; servers ignore it. Of a call for several
+    scenes, the same text for the same scenes: our clients send the first of `scenes` by name, and for a scene_group
+    "scenes?" with its labels as a query string, "scenes?floor=2&site=a".
 
     Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
     server's clock, `x-mapless-version`, its version, and `x-mapless-connections`, the number of connections that it can hold.
@@ -92,7 +94,9 @@ class LocalizationServiceServicer(object):
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
-    in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
+    in front of several servers, which keep a scene's calls at one server by it; servers ignore it. Of a call for several
+    scenes, the same text for the same scenes: our clients send the first of `scenes` by name, and for a scene_group
+    "scenes?" with its labels as a query string, "scenes?floor=2&site=a".
 
     Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
     server's clock, `x-mapless-version`, its version, and `x-mapless-connections`, the number of connections that it can hold.
@@ -229,7 +233,9 @@ class LocalizationService(object):
     * `x-client-id`: names the caller, 1 to 64 of the same characters. A tenant's callers share the server fairly, however
     many calls each of them makes; without it, each connection is one caller.
     * `x-mapless-scene`: "scenes/{scene}", the scene of the call, as in the request itself. For load balancers
-    in front of several servers, which keep a scene's calls at one server by it; servers ignore it.
+    in front of several servers, which keep a scene's calls at one server by it; servers ignore it. Of a call for several
+    scenes, the same text for the same scenes: our clients send the first of `scenes` by name, and for a scene_group
+    "scenes?" with its labels as a query string, "scenes?floor=2&site=a".
 
     Trailing metadata of an answer: `x-request-id`, and where the call succeeds `x-mapless-time`, seconds since 1970 by the
     server's clock, `x-mapless-version`, its version, and `x-mapless-connections`, the number of connections that it can hold.

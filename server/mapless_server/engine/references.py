@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapless.geometry import Array
 from mapless_server.engine.photo_views import QueryViews, RasterForm
 from mapless_server.engine.query import Description, Photo, SceneQuestion
 from mapless_server.errors import DataLoss, InvalidArgument, NotFound
@@ -22,6 +23,7 @@ from mapless_server.scenes.retrieval.index import Entries, GlobalDescriptor
 from mapless_server.scenes.retrieval.ranking import nearest_references, rank_among
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey
+from mapless_server.store import GroupedScene
 from mapless_server.store.queries import reference_not_found
 
 from .query import POSE_PRIOR
@@ -130,6 +132,10 @@ class References:
             vector = main.descriptor.describe(view)
             found = rank_among([(entries, question.narrowing) for question, entries in read], vector, count)
         return [(question, some) for (question, _), some in zip(read, found, strict=True)]
+
+    def extents_m(self, scenes: Sequence[GroupedScene]) -> Array:
+        """Distances (N,) of scenes' furthest references from the origins of their worlds; infinite if not known."""
+        return self.retrievals[0].indexes.extents_m(scenes)
 
     def _entries_of(self, question: SceneQuestion, context: StageContext) -> tuple[SceneQuestion, Entries] | None:
         """The references of one of several scenes; None, and a line in the log, if it cannot be read."""

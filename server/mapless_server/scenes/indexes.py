@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Sequence
 
+import numpy as np
+
+from mapless.geometry import Array
 from mapless_server.cache import LruCache
 from mapless_server.errors import DataLoss, NotFound, RequestError
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
-from mapless_server.store import Store
+from mapless_server.store import GroupedScene, Store
 
 from .library import KeyedLocks, Loaded, ReferenceLibrary, load_usable
 from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 
 log = logging.getLogger(__name__)
+
+
+REMEMBERED_EXTENTS = 100_000
+"""Scenes of which the extent is remembered after their index was evicted, some 20 MB."""
 
 
 class SceneIndexes:
@@ -42,7 +50,17 @@ class SceneIndexes:
         self._descriptor = descriptor
         self._extractor = extractor
         self._cached: LruCache[_CachedIndex] = LruCache(capacity_bytes, keeps_latest=True)
+        self._extents: LruCache[tuple[int, float]] = LruCache(REMEMBERED_EXTENTS)
         self._lock = threading.Lock()
+
+    def extents_m(self, scenes: Sequence[GroupedScene]) -> Array:
+        """Distances (N,) of the furthest references of scenes from the origins of their worlds.
+
+        Infinite where it is not known as of the scene's generation.
+        """
+        known = [self._extents.get(it.scene_key) for it in scenes]
+        pairs = zip(scenes, known, strict=True)
+        return np.array([it[1] if it and it[0] == scene.generation else math.inf for scene, it in pairs])
 
     @property
     def size_bytes(self) -> int:
@@ -196,6 +214,10 @@ class SceneIndexes:
         with self._lock:
             if self._cached.get(scene_key) is cached:
                 self._cached.put(scene_key, cached, cached.index.size_bytes)
+        before = self._extents.get(scene_key)
+        if before is None or before[0] != entries.generation:
+            distances_m = np.linalg.norm(entries.centres(entries.rows()), axis=1)
+            self._extents.put(scene_key, (entries.generation, float(distances_m.max(initial=0.0))), 1)
         return entries
 
     def _get(self, scene_key: SceneKey) -> _CachedIndex:

@@ -112,7 +112,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self, request: pb.LocalizeRequest, principal: Principal
     ) -> tuple[Sequence[SceneQuestion], SceneKey | None]:
         """Finds the scenes of a request with several; FieldError or NotFound names the wrong field."""
-        return questions_from_message(request, self._scenes.find(request, principal), principal.tenant)
+        extents = self._engine().references.extents_m
+        return questions_from_message(request, self._scenes.find(request, principal), principal.tenant, extents)
 
     async def _answer(
         self,

@@ -166,3 +166,4 @@ def _remove_other_scenes(answer: pb.LocalizeResponse) -> None:
         its = [it for it in hypotheses if it.scene == answer.scene]
         del hypotheses[:]
         hypotheses.extend(its)
+        answer.rejection.message = "poses in several scenes explain the photograph"

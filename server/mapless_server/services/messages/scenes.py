@@ -90,7 +90,7 @@ def scene_keys_from_message(request: pb.LocalizeRequest, tenant: str) -> list[Sc
 
 
 def questions_from_message(
-    request: pb.LocalizeRequest, found: FoundScenes, tenant: str, extents: ReadExtents | None = None
+    request: pb.LocalizeRequest, found: FoundScenes, tenant: str, extents: ReadExtents
 ) -> tuple[Sequence[SceneQuestion], SceneKey | None]:
     """The scenes to search, each with the request's priors in its world; and the scene of its pose prior, if any.
 
@@ -199,13 +199,13 @@ class _ScenePriors:
     def _prior_datum(self) -> Datum | None:
         return None if self.prior_index is None else self.found.attributes[self.prior_index].datum
 
-    def reached(self, extents: ReadExtents | None) -> Sequence[int]:
+    def reached(self, extents: ReadExtents) -> Sequence[int]:
         """Indices of the scenes that may have references where the priors allow or expect the camera."""
         places = [] if self._prior_datum is None else [(self.given[0], self._prior_datum)]
         if self.on_earth.HasField("geo_position_prior"):
             places.append(narrowing_at_place(self.on_earth.geo_position_prior, "geo_position_prior"))
         count = len(self.found.scenes)
-        if extents is None or not places:
+        if not places:
             return range(count)
         placed = np.flatnonzero(np.isfinite(self.found.origins_in_ecef[:, 0]))
         origins, radii_m = self.found.origins_in_ecef[placed], extents(self.found.scenes)[placed]

@@ -1,0 +1,180 @@
+"""Several scenes in one call through a real server: what is found, refused, watched, logged and captured."""
+
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+from support.corner import CAMERA, PAPERS, photograph, pose, wallpaper
+from support.servers import RunningServer, serving_really
+from support.waiting import wait_until
+
+from mapless import (
+    Client,
+    Datum,
+    GeoPositionPrior,
+    InvalidArgument,
+    LocalizationResult,
+    MaplessError,
+    NewReference,
+    NotFound,
+    PosePrior,
+    PositionPrior,
+    Priors,
+    Rejected,
+)
+from mapless.geodesy import world_from_other_world
+from mapless.v1 import localization_service_pb2 as pb
+from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
+from mapless_server.services.capture.calls import decode_call
+from mapless_server.services.capture.folder import calls_of
+
+HALL, YARD = Datum(47.0, 8.0, 400.0), Datum(47.001, 8.0, 400.0)
+OTHERS = [tuple(wallpaper(seed) for seed in range(first, first + 3)) for first in (10, 20)]
+POSES = [pose(angle, height) for angle in (-12, 0, 12) for height in (-1.8, -1.2)]
+TRUE = pose(2.0, -1.5)
+PHOTO = photograph(TRUE)
+SITE_A: dict[str, str] = {"site": "a"}
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
+    folder = tmp_path_factory.mktemp("several")
+    options: dict[str, Any] = {"features": "sift", "backend": "geometric", "background_matching": False}
+    with serving_really(folder / "data", capture_dir=folder / "captured", allow_watching=True, **options) as server:
+        with Client(server.address) as client:
+            fill(client, "hall", PAPERS, labels=SITE_A, datum=HALL)
+            fill(client, "yard", OTHERS[0], labels=SITE_A, datum=YARD)
+            fill(client, "doll", OTHERS[1], labels=SITE_A, arbitrary_unit=True)
+            fill(client, "twin", PAPERS, labels={"site": "b"})
+        yield server
+
+
+@pytest.fixture(scope="module")
+def client(server: RunningServer) -> Iterator[Client]:
+    with Client(server.address) as client:
+        yield client
+
+
+def fill(client: Client, scene_id: str, papers: Any, **attributes: Any) -> None:
+    client.create_scene(scene_id, **attributes)
+    references = [NewReference(f"r{i}", photograph(at, papers=papers), CAMERA, at) for i, at in enumerate(POSES)]
+    client.add_references(scene_id, references)
+
+
+def found(client: Client, photo: bytes = PHOTO, **where: Any) -> LocalizationResult:
+    answer = client.localize(photo, CAMERA, **where)
+    assert isinstance(answer, LocalizationResult), str(answer)
+    return answer
+
+
+@pytest.mark.parametrize("where", [{"scenes": ["yard", "hall"]}, {"group": SITE_A}, {"scenes": ["hall"]}])
+def test_the_answer_is_the_one_with_its_scene_named(client: Client, where: dict[str, Any]) -> None:
+    named, answer = found(client, scene="hall"), found(client, **where)
+    assert (named.scene, answer.scene) == ("scenes/hall", "scenes/hall")
+    np.testing.assert_array_equal(answer.world_from_camera.matrix(), named.world_from_camera.matrix())
+    assert (answer.accuracy, answer.trust, answer.geo_pose) == (named.accuracy, named.trust, named.geo_pose)
+    assert answer.diagnostics.references == named.diagnostics.references
+    several, count = answer.diagnostics, len(where.get("scenes", "abc"))
+    assert several.searched_scene_count == count
+    assert [it.scene for it in several.scenes if it.attempted] == (["scenes/hall"] if count > 1 else [])
+    assert named.diagnostics.searched_scene_count == 1
+
+
+def test_the_unit_is_that_of_the_scene_that_was_found(client: Client) -> None:
+    answer = found(client, photograph(TRUE, papers=OTHERS[1]), group=SITE_A)
+    assert (answer.scene, answer.arbitrary_unit) == ("scenes/doll", True)
+    assert not found(client, group=SITE_A).arbitrary_unit
+
+
+def test_a_position_narrows_the_scenes_to_those_in_its_reach(client: Client) -> None:
+    found(client, group=SITE_A)  # by then it is known how far their references reach
+    near_hall = Priors(geo_position=GeoPositionPrior(47.0, 8.0, 5.0))
+    assert found(client, group=SITE_A, priors=near_hall).diagnostics.searched_scene_count == 2  # one has no datum
+    at_yard = PositionPrior(np.zeros(3), 20.0)
+    answer = client.localize(PHOTO, CAMERA, group=SITE_A, prior_scene="yard", priors=Priors(position=at_yard))
+    assert isinstance(answer, Rejected)
+    assert answer.diagnostics.searched_scene_count == 2
+
+
+@pytest.mark.parametrize("prior_scene", ["hall", "yard"])
+def test_a_pose_prior_in_any_world_helps_where_it_belongs(client: Client, prior_scene: str) -> None:
+    there = TRUE if prior_scene == "hall" else world_from_other_world(YARD, HALL).compose(TRUE)
+    prior = Priors(pose=PosePrior.from_sigmas(there, 0.05, 1.0))
+    answer = found(client, group=SITE_A, prior_scene=prior_scene, priors=prior)
+    assert answer.scene == "scenes/hall"
+    assert [it.conflict for it in answer.prior_checks] == [False]
+    assert answer.diagnostics.is_tracked == (prior_scene == "hall")
+
+
+def test_two_scenes_that_fit_are_both_named(client: Client) -> None:
+    answer = client.localize(PHOTO, CAMERA, group={})
+    assert isinstance(answer, Rejected)
+    assert answer.reason == "AMBIGUOUS"
+    assert sorted(it.scene for it in answer.hypotheses) == ["scenes/hall", "scenes/twin"]
+
+
+def test_watchers_see_answers_of_their_scene_and_nothing_of_others(client: Client, server: RunningServer) -> None:
+    """The twin's first message is the answer in it alone: not that hall and twin fit, which the hall's watcher sees."""
+    with grpc.insecure_channel(server.address) as channel:
+        stub = LocalizationServiceStub(channel)
+        watches = [
+            stub.WatchQueries(pb.WatchQueriesRequest(scene=f"scenes/{it}"), timeout=60) for it in ("hall", "twin")
+        ]
+        for watch in watches:
+            watch.initial_metadata()
+        found(client, group=SITE_A)
+        client.localize(PHOTO, CAMERA, group={})
+        found(client, scene="twin")
+        in_hall, in_either = next(watches[0]).answer, next(watches[0]).answer
+        assert next(watches[1]).answer.diagnostics.searched_scene_count == 1
+    assert in_hall.HasField("debug")
+    assert in_either.rejection.reason == pb.REJECTION_REASON_AMBIGUOUS
+    for answer in (in_hall, in_either):
+        assert not [it for it in ("twin", "yard", "doll") if it in str(answer)]
+
+
+def test_the_log_names_the_scene_that_was_found(client: Client, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        found(client, group=SITE_A)
+        wait_until(lambda: any("Localize OK" in it.getMessage() for it in caplog.records))
+    (line,) = [it for it in caplog.records if it.getMessage() == "Localize OK"]
+    fields = vars(line)["fields"]
+    assert (fields["scene"], fields["scenes"], fields["searched_scenes"]) == ("hall", 3, 3)
+
+
+GEO = Priors(geo_position=GeoPositionPrior(47.0, 8.0, 5.0))
+NEAR = Priors(position=PositionPrior(np.zeros(3), 5.0))
+BAD: list[tuple[dict[str, Any], type[MaplessError], str]] = [
+    ({"group": {"site": "x"}}, NotFound, "scene_group"),
+    ({"group": {"a b": "c"}}, InvalidArgument, "scene_group.labels"),
+    ({"scenes": ["hall", "nowhere"]}, NotFound, "scenes[1]"),
+    ({"scenes": ["hall", "hall"]}, InvalidArgument, "scenes[1]"),
+    ({"scenes": [f"s{i}" for i in range(65)]}, InvalidArgument, "scenes"),
+    ({"group": SITE_A, "priors": NEAR}, InvalidArgument, "prior_scene"),
+    ({"group": SITE_A, "priors": NEAR, "prior_scene": "twin"}, InvalidArgument, "prior_scene"),
+    ({"scene": "hall", "prior_scene": "yard"}, InvalidArgument, "prior_scene"),
+    ({"scenes": ["doll", "twin"], "priors": GEO}, InvalidArgument, "geo_position_prior"),
+]
+
+
+@pytest.mark.parametrize(("where", "error", "field"), BAD)
+def test_a_wrong_group_is_refused_by_its_field(
+    client: Client, where: dict[str, Any], error: type[MaplessError], field: str
+) -> None:
+    with pytest.raises(error) as refused:
+        client.localize(PHOTO, CAMERA, **where)
+    assert refused.value.field == field
+
+
+def test_a_captured_call_is_kept_with_the_scene_that_was_found(
+    client: Client, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.getbasetemp() / "several0" / "captured"
+    before = len(calls_of(folder))
+    found(client, group=SITE_A)
+    wait_until(lambda: len(calls_of(folder)) > before)
+    call = decode_call(calls_of(folder)[-1].read_bytes())
+    assert (call.scene_id, call.attributes.datum) == ("hall", HALL)
