@@ -20,10 +20,10 @@ from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES
 from mapless_server.engine.options import EngineOptions
-from mapless_server.engine.query import Query
+from mapless_server.engine.query import Query, SceneQuestion
 from mapless_server.images import image_size
 from mapless_server.method.bundle.priors import DirectionPrior, PosePrior, PositionPrior, Prior
-from mapless_server.security import scene_id_of, tenant_of
+from mapless_server.security import key_of, scene_id_of, tenant_of
 from mapless_server.services.messages.answers import MAX_SESSION_COORDINATE_M, answer_frames_of, set_frames
 from mapless_server.services.messages.groups import (
     poses_from_message,
@@ -32,8 +32,20 @@ from mapless_server.services.messages.groups import (
     session_poses_from_message,
 )
 from mapless_server.services.messages.priors import needs_attributes
-from mapless_server.services.messages.queries import MAX_CANDIDATES, MAX_REFERENCES, query_from_message
-from mapless_server.store import SceneAttributes
+from mapless_server.services.messages.queries import (
+    MAX_CANDIDATES,
+    MAX_REFERENCES,
+    query_among,
+    query_from_message,
+)
+from mapless_server.services.messages.references import labels_from_message
+from mapless_server.services.messages.scenes import (
+    FoundScenes,
+    names_several,
+    questions_from_message,
+    scene_keys_from_message,
+)
+from mapless_server.store import GroupedScene, SceneAttributes
 
 from . import messages
 from .images import seeds as image_seeds
@@ -45,6 +57,15 @@ ENGINE = EngineOptions()
 TENANT = "acme"
 KNOWN = SceneAttributes(Datum(48.1, 11.6, 520.0, Quaternion(0.5, -0.5, -0.5, 0.5)))
 """Attributes of the scene that requests name."""
+
+KINDS_OF_SCENES = (
+    KNOWN,
+    SceneAttributes(Datum(-33.9, 151.2, 40.0)),
+    SceneAttributes(down_in_world=(0.0, 1.0, 0.0)),
+    SceneAttributes(arbitrary_unit=True),
+)
+FURTHEST_M = 10 * MAX_COORDINATE_M
+"""Coordinates in the world of a scene of what is given in that of another, on the other side of the Earth."""
 
 CAMERA = Camera(32, 33, 30.0, 31.0, 15.5, 16.25)
 POSE = RigidTransform(rotation_from_vector([0.2, -0.7, 0.15]), np.array([1.5, -0.25, 2.0]))
@@ -62,6 +83,9 @@ def check(data: bytes) -> bool:
 
 def _check_localize(request: pb.LocalizeRequest) -> None:
     addressee = answer_frames_of(request)
+    if names_several(request):
+        _check_among(request)
+        return
     attributes = KNOWN if needs_attributes(request) else SceneAttributes()
     query = query_from_message(request, TENANT, ENGINE, attributes)
     _check_query(query, [request.scene])
@@ -70,6 +94,23 @@ def _check_localize(request: pb.LocalizeRequest) -> None:
     answer = pb.Localization()
     set_frames(answer, POSE, COVARIANCE, addressee.axes, addressee.session_from_camera, attributes.datum)
     _check_finite(answer)
+
+
+def _check_among(request: pb.LocalizeRequest) -> None:
+    """Among the scenes that a request lists, which exist, or those of a group; of all kinds by turns."""
+    keys = scene_keys_from_message(request, TENANT) if request.scenes else [key_of(TENANT, it) for it in "abcdef"]
+    labels_from_message(request.scene_group.labels, "scene_group.labels")
+    scenes = [
+        GroupedScene(key, 1, 0, partial(KINDS_OF_SCENES.__getitem__, i % len(KINDS_OF_SCENES)))
+        for i, key in enumerate(keys)
+    ]
+    questions, prior_scene = questions_from_message(request, FoundScenes(scenes), TENANT, lambda _: np.ones(len(keys)))
+    query = query_among(request, ENGINE, questions, prior_scene)
+    asked = query.scenes or [SceneQuestion(query.scene_key, query.narrowing, query.priors)]
+    assert {it.scene_key for it in asked} <= set(keys)
+    assert len({it.scene_key for it in asked}) == len(asked) >= 1
+    for it in asked:
+        _check_query(query.in_scene(it), [f"scenes/{scene_id_of(it.scene_key)}"], FURTHEST_M)
 
 
 def _check_rig(request: pb.LocalizeRigRequest) -> None:
@@ -100,7 +141,7 @@ def _check_watch(request: pb.WatchQueriesRequest) -> None:
 _CHECKS: dict[type, Any] = dict(zip(KINDS, (_check_localize, _check_rig, _check_sequence, _check_watch), strict=True))
 
 
-def _check_query(query: Query, names: Sequence[str]) -> None:
+def _check_query(query: Query, names: Sequence[str], furthest_m: float = MAX_COORDINATE_M) -> None:
     assert tenant_of(query.scene_key) == TENANT
     assert names == [f"scenes/{check_id(scene_id_of(query.scene_key))}"]
     assert len(set(query.reference_ids)) == len(query.reference_ids)
@@ -112,10 +153,10 @@ def _check_query(query: Query, names: Sequence[str]) -> None:
     size = image_size(query.photo.image, ENGINE.image_limits)
     assert size == (query.photo.camera.width_px, query.photo.camera.height_px)
     for prior in query.priors:
-        _check_prior(prior)
+        _check_prior(prior, furthest_m)
     narrowing = query.narrowing
     if narrowing.position is not None:
-        assert np.abs(narrowing.position.position).max() <= MAX_COORDINATE_M
+        assert np.abs(narrowing.position.position).max() <= furthest_m
         assert 0 < narrowing.position.radius_m < np.inf
     centres = np.array([POSE.translation, [1e7, -1e7, 0.0]])
     for place in (narrowing.position, *narrowing.likely_positions):
@@ -126,13 +167,13 @@ def _check_query(query: Query, names: Sequence[str]) -> None:
             assert cone.keeps(np.eye(3), narrowing.margin_deg).shape == (3,)
 
 
-def _check_prior(prior: Prior) -> None:
+def _check_prior(prior: Prior, furthest_m: float) -> None:
     if isinstance(prior, PositionPrior | PosePrior):
         check_covariance(prior.covariance, 3 if isinstance(prior, PositionPrior) else 6)
     if isinstance(prior, PositionPrior):
         assert np.isfinite(prior.position).all()
     if isinstance(prior, PosePrior):
-        check_pose(prior.world_from_camera)
+        check_pose(prior.world_from_camera, furthest_m)
     if isinstance(prior, DirectionPrior):
         check_unit(prior.in_camera)
         check_unit(prior.in_world)
@@ -179,12 +220,19 @@ def seeds() -> tuple[bytes, ...]:
     near.position_prior.CopyFrom(
         pb.PositionPrior(position_m=geometry_pb2.Vector3(x=1), radius_m=3, covariance_m2=COVARIANCE[:3, :3].ravel())
     )
+    listed = pb.LocalizeRequest(scenes=["scenes/a", "scenes/b", "scenes/c"], prior_scene="scenes/b", **photo)
+    group = pb.LocalizeRequest(prior_scene="scenes/a", **photo)
+    group.scene_group.labels["site"] = "a"
+    for among, with_priors in ((listed, near), (group, full)):
+        for field, value in with_priors.ListFields():
+            if field.name.endswith("_prior"):
+                getattr(among, field.name).CopyFrom(value)
     rig = pb.LocalizeRigRequest(scene="scenes/hall", session_from_rig=pose)
     sequence = pb.LocalizeSequenceRequest(scene="scenes/hall")
     for _ in range(3):
         rig.images.add(rig_from_camera=pose, references=names, **photo)
         sequence.frames.add(session_from_camera=pose, **photo)
-    made = (plain, named, full, near, rig, sequence, pb.WatchQueriesRequest(scene="scenes/hall"))
+    made = (plain, named, full, near, listed, group, rig, sequence, pb.WatchQueriesRequest(scene="scenes/hall"))
     return tuple(messages.encoded(KINDS, it) for it in made)
 
 

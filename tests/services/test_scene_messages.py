@@ -158,6 +158,14 @@ def test_limits_in_one_world_hold_at_the_same_places_of_another() -> None:
         assert there.priors.cost(same) == pytest.approx(here.priors.cost(pose), rel=1e-3, abs=1e-6)
 
 
+def test_the_widest_and_the_surest_prior_can_be_turned() -> None:
+    wide = {"position_m": {}, "covariance_m2": np.diag([1e-8, 1e12, 1e4]).ravel().tolist()}
+    _, there = questions(found(HALL, YARD), prior_scene="scenes/s0", position_prior=wide)
+    assert there.priors.position is not None
+    sigmas_m = np.sqrt(np.linalg.eigvalsh(there.priors.position.covariance))
+    np.testing.assert_allclose(sigmas_m, [10.0, 100.0, 1e6], rtol=0.01)
+
+
 def test_priors_of_one_world_count_only_where_both_have_datums() -> None:
     hall, lost = questions(found(HALL, LOST), prior_scene="scenes/s0", position_prior=NEAR)
     assert (hall.narrowing.position is None, lost.narrowing.is_empty, bool(lost.priors)) == (False, True, False)

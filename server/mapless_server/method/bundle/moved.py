@@ -11,13 +11,17 @@ from mapless.geometry import Array, RigidTransform
 
 from .priors import DirectionPrior, PosePrior, PositionPrior, Priors
 
+MIN_SIGMA_RATIO = 1e-5
+"""Ratio of standard deviations that rounding leaves of a covariance when its axes are turned."""
+
 Direction = TypeVar("Direction", bound=DirectionPrior)
 
 
 def moved_priors(priors: Priors, other_from_world: RigidTransform) -> Priors:
     """The priors in another world, in which the world that they are given in has a pose.
 
-    A position p becomes R p + t, a direction R d, and each three axes of a covariance C become R C R^T.
+    A position p becomes R p + t, a direction R d, and each three axes of a covariance C become R C R^T, with the
+    variance of `MIN_SIGMA_RATIO` of the largest one added in all directions.
     """
     it = priors
     return Priors(
@@ -43,5 +47,6 @@ def _moved_pose(prior: PosePrior, other_from_world: RigidTransform) -> PosePrior
 
 def _turned(covariance: Array, other_from_world: RigidTransform) -> Array:
     turn = np.kron(np.eye(len(covariance) // 3), other_from_world.rotation)
-    turned = turn @ covariance @ turn.T
+    largest = np.repeat(np.diag(covariance).reshape(-1, 3).max(axis=1), 3)
+    turned = turn @ covariance @ turn.T + np.diag(MIN_SIGMA_RATIO**2 * largest)
     return np.asarray((turned + turned.T) / 2)
