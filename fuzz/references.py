@@ -146,7 +146,7 @@ class WatchfulStore:
         assert codec.decode_attributes(owner, row["attributes"], row["attributes_sha256"]) == attributes
         return SceneRecord(key, 1, 0, _NOW, attributes, labels)
 
-    def update_scene(self, key: SceneKey, **changes: Any) -> SceneRecord:
+    def update_scene(self, key: SceneKey, limit: object = None, **changes: Any) -> SceneRecord:
         assert changes
         assert UNCHANGED not in changes.values()
         labels = changes.pop("labels", NO_LABELS)
@@ -155,10 +155,13 @@ class WatchfulStore:
     def delete_scene(self, key: SceneKey) -> None:
         check_key(key)
 
-    def list_scenes(self, tenant: str, limit: int, after: str, labels: Mapping[str, str]) -> list[SceneRecord]:
-        check_page(limit, after)
+    def list_scenes(
+        self, tenant: str, count: int, after: str, labels: Mapping[str, str], limit: object
+    ) -> list[SceneRecord]:
+        assert limit is None
+        check_page(count, after)
         check_labels(labels)
-        return [self.create_scene(key_of(tenant, f"s{i}")) for i in range(min(limit, 3))]
+        return [self.create_scene(key_of(tenant, f"s{i}")) for i in range(min(count, 3))]
 
     def add_references(self, key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
         check_key(key)
