@@ -27,7 +27,7 @@ def statements(store: Store) -> Iterator[list[str]]:
         engine = connection.engine
 
     def note(*arguments: object) -> None:
-        if str(arguments[2]).startswith("SELECT scene."):
+        if str(arguments[2]).startswith("SELECT scene"):
             found.append(str(arguments[2]))
 
     event.listen(engine, "before_cursor_execute", note)

@@ -30,8 +30,11 @@ class Reach:
         return await self._key(call.principal, scene_id), reference_id
 
     async def _key(self, caller: Principal, scene_id: str) -> SceneKey:
-        if caller.limit is None:
+        limit = caller.limit
+        if limit is None or scene_id in limit.scene_ids:
             return key_of(caller.tenant, scene_id)
+        if not limit.labels:
+            return key_of(NOWHERE, scene_id)
         (key,) = await asyncio.to_thread(self.keys, caller, [scene_id])
         return key
 

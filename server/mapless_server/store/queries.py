@@ -5,11 +5,11 @@ reading the whole scene.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, insert, or_, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, func, insert, or_, select, update
 from sqlalchemy.dialects import sqlite
 
 from mapless.names import reference_name, scene_name
@@ -72,6 +72,14 @@ def select_scenes_of(
     is_theirs = ~key.contains(KEY_SEPARATOR) if tenant == DEFAULT_TENANT else key < end_of_keys(tenant)
     found = select_scenes().where(key > key_of(tenant, after), is_theirs, *have_labels(labels.items()))
     return (found if limit is None else found.where(is_within(limit, tenant))).order_by(key)
+
+
+def select_labelled(keys: Sequence[SceneKey], labels: Collection[tuple[str, str]]) -> Select[Any]:
+    """Those of some keys whose scenes have all these labels; reads labels alone."""
+    column = scene_label.c
+    is_one = or_(*(and_(column.name == name, column.value == value) for name, value in sorted(labels)))
+    found: Select[Any] = select(column.scene_id).where(column.scene_id.in_(keys), is_one)
+    return found.group_by(column.scene_id).having(func.count() == len(labels))
 
 
 def have_labels(labels: Iterable[tuple[str, str]]) -> list[ColumnElement[bool]]:
