@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -11,11 +12,14 @@ from support.servers import CAMERA, PHOTO, ending, localize_request, pose, servi
 from support.tokened import LIMIT_S, REFERENCE_SERVICE, Guarded, requests_on
 from support.waiting import wait_until
 
+import mapless_tools.demo
 from mapless import AlreadyExists, Client, LocalizationResult, MaplessError, NewReference, NotFound, PermissionDenied
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2 import ListScenesRequest, ListScenesResponse
 from mapless_server.security import create_token
+from mapless_tools.ingest.existing import open_scene
+from mapless_tools.ingest.formats.cameras import read_folder
 
 SITE_A, SITE_B = {"site": "a"}, {"site": "b"}
 LIMITS: dict[str, dict[str, Any]] = {
@@ -142,6 +146,15 @@ def test_a_scene_that_is_created_must_be_within_the_limit(limited: Guarded) -> N
         assert everything.get_scene("barn").labels == SITE_B
         named.delete_scene("later")
         site.delete_scene("fresh")
+
+
+def test_an_import_uses_a_scene_that_its_token_could_not_create(limited: Guarded) -> None:
+    dataset = read_folder(Path(mapless_tools.demo.__file__).parent / "room")
+    with limited.client("site") as site:
+        assert [it.reference_id for it in open_scene(site, "yard", dataset, dataset.frames)] == ["r"]
+        for scene_id in ("barn", "none"):
+            with pytest.raises(PermissionDenied, match="would not be one of them"):
+                open_scene(site, scene_id, dataset, dataset.frames)
 
 
 def test_labels_do_not_take_a_scene_out_of_the_limit(limited: Guarded) -> None:

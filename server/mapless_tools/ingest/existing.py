@@ -6,7 +6,7 @@ from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
-from mapless import AlreadyExists, Client, Reference
+from mapless import AlreadyExists, Client, NotFound, PermissionDenied, Reference
 from mapless.geometry import Camera, RigidTransform
 from mapless.provenance import GIVEN_POSE, UNKNOWN, Provenance
 from mapless_server.method.pairs.readings.repeats import pose_difference
@@ -132,11 +132,14 @@ def open_scene(
         client.create_scene(
             scene, datum=dataset.datum, down_in_world=dataset.down_in_world, arbitrary_unit=is_arbitrary
         )
-    except AlreadyExists:
-        pass
-    else:
         return []
-    there = client.get_scene(scene)
+    except AlreadyExists:
+        there = client.get_scene(scene)
+    except PermissionDenied as error:  # a token may be for a scene that it could not create
+        try:
+            there = client.get_scene(scene)
+        except NotFound:
+            raise error from None
     existing = list(client.list_references(scene, page_size=1000))
     if (
         (existing and is_aligned)
