@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,23 @@ def test_a_group_out_of_the_limit_is_as_one_that_is_absent(limited: Guarded) -> 
         failures = [limited.failure(LOCALIZE, group(site), limited.tokens[caller]) for site in ("b", "z")]
         assert said(failures[0], "site=b") == said(failures[1], "site=z")
         assert isinstance(failures[0], NotFound)
+
+
+@pytest.mark.parametrize("caller", LIMITS)
+def test_a_search_finds_only_scenes_within_the_limit(limited: Guarded, caller: str) -> None:
+    visible = VISIBLE[caller]
+    several: tuple[dict[str, Any], ...] = ({"group": {}}, {"scenes": visible})
+    with limited.client(caller) as client:
+        for where in several:
+            answer = client.localize(PHOTO, CAMERA, **where)  # in all scenes at once, which have one photograph
+            assert answer.diagnostics.searched_scene_count == len(visible)
+            text = repr(answer)
+            assert [it for it in SCENES if f"scenes/{it}" in text and it not in visible] == []
+            if visible == ["hall"]:
+                assert isinstance(answer, LocalizationResult)
+                assert answer.scene == "scenes/hall"
+        with pytest.raises(NotFound) if caller == "named" else nullcontext():
+            client.localize(PHOTO, CAMERA, group=SITE_A)
 
 
 def test_another_tokens_page_shows_only_ones_own_scenes(limited: Guarded) -> None:

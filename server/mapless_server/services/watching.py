@@ -161,6 +161,7 @@ class Watchers:
 def _remove_other_scenes(answer: pb.LocalizeResponse) -> None:
     """Removes what an answer says of other scenes than its own."""
     answer.diagnostics.ClearField("scenes")
+    answer.diagnostics.searched_scene_count = 1
     hypotheses = answer.rejection.hypotheses
     if answer.HasField("rejection") and any(it.scene != answer.scene for it in hypotheses):
         its = [it for it in hypotheses if it.scene == answer.scene]
