@@ -31,6 +31,7 @@ from mapless_server.security import scene_id_of
 from . import choosing
 from .failures import SceneMadeAnew
 from .query import SceneQuestion, Tier
+from .references import References
 from .scene_group import RankedScene
 from .situation import situation_of
 
@@ -58,11 +59,13 @@ def with_scenes(search: Search, tier: Tier) -> Search:
 def _chosen(search: Search, tier: Tier) -> tuple[Sequence[Chosen], Search]:
     """The references that resemble the photograph, and the search with it turned as these are held."""
     assert search.group is not None
+    source = search.source
+    assert isinstance(source, References)
     query, count = search.group.query, choosing.SHORTLIST * search.group.query.reference_count
     search = search.but(query=query, views=search.group.views, material=None)
     for _ in range(2):
         views = search.views.in_form(RasterForm(max_pixels=tier.max_pixels))
-        found = search.source.choose_among(query.scenes, views, count, search.context)
+        found = source.choose_among(query.scenes, views, count, search.context)
         likely = max((it for it in found if it[1]), key=lambda it: it[1][0].similarity, default=None)
         if likely is None or likely[0].priors.gravity is None:
             break
@@ -143,9 +146,9 @@ def verdict_among(search: Search) -> Verdict:
 
 def _world(search: Search) -> World:
     assert search.own is not None
-    name, datum = scene_id_of(search.query.scene_key), search.materials[-1].attributes.datum
+    key, datum = search.query.scene_key, search.materials[-1].attributes.datum
     ecef_from_world = None if datum is None else datum.ecef_from_world()
-    return World(name, search.found, search.own, search.query.priors, ecef_from_world)
+    return World(key, scene_id_of(key), search.found, search.own, search.query.priors, ecef_from_world)
 
 
 def following(search: Search, tiers: Sequence[Tier], promise: PromiseOptions) -> Iterator[tuple[ladder.Rung, Attempt]]:

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from mapless_server.method.features.extractors import FeatureExtractor
     from mapless_server.method.options import StageContext
-    from mapless_server.scenes import Choice, RankedReference, Selection
+    from mapless_server.scenes import Choice, Selection
     from mapless_server.scenes.later import Pending
     from mapless_server.scenes.library import Loaded
     from mapless_server.security import SceneKey
 
     from .photo_views import QueryViews
-    from .query import SceneQuestion
 
 
 class ReferenceSource(Protocol):
@@ -43,16 +42,6 @@ class ReferenceSource(Protocol):
         extractor: FeatureExtractor | None = None,
     ) -> Choice:
         """Chooses references for a photograph, by what is made of this extractor's features if there is such."""
-        ...
-
-    def choose_among(
-        self,
-        questions: Sequence[SceneQuestion],
-        views: QueryViews,
-        count: int,
-        context: StageContext,
-    ) -> Sequence[tuple[SceneQuestion, Sequence[RankedReference]]]:
-        """Chooses references for a photograph in several scenes, the most similar of all; see `References`."""
         ...
 
     def pending(self, scene_key: SceneKey) -> Sequence[Pending]:

@@ -36,13 +36,15 @@ class World:
     """The results of a photograph's attempts in one of several worlds.
 
     Attributes:
-        name: name of the world, in messages and hypotheses.
+        key: name of the world, in hypotheses.
+        name: the same in messages.
         found: the results, in order, at least one.
         verdict: what `decide` says of them.
         priors: the photograph's priors, in this world.
         ecef_from_world: the pose of the world on the Earth; None if it is not known.
     """
 
+    key: str
     name: str
     found: Sequence[Found]
     verdict: Verdict
@@ -65,8 +67,8 @@ class World:
         outcome = self.verdict.outcome
         if not isinstance(outcome, Rejection):
             return self.verdict
-        hypotheses = tuple(replace(it, world=self.name) for it in outcome.hypotheses)
-        imprecise = outcome.imprecise and replace(outcome.imprecise, world=self.name)
+        hypotheses = tuple(replace(it, world=self.key) for it in outcome.hypotheses)
+        imprecise = outcome.imprecise and replace(outcome.imprecise, world=self.key)
         return replace(self.verdict, outcome=replace(outcome, hypotheses=hypotheses, imprecise=imprecise))
 
 
@@ -83,7 +85,7 @@ class _Rival:
         return next(iter(self.place.accepted), self.place.poses[0])
 
     def as_hypothesis(self) -> PoseHypothesis:
-        return replace(self.place.as_hypothesis(), world=self.world.name)
+        return replace(self.place.as_hypothesis(), world=self.world.key)
 
     def is_one_place_with(self, other: "_Rival", options: PlaceOptions) -> bool:
         """Whether poses of both agree on the Earth."""
@@ -112,9 +114,10 @@ def decide_among(worlds: Sequence[World], options: PlaceOptions = PLACES) -> Ver
     if isinstance(decided, int):
         return rivals[decided].world.named()
     first, second = places[:2]
+    one, other = (it.world.name for it in rivals[:2])
     message = (
-        f"poses in two scenes explain the photograph: one in {first.world!r} with {first.inlier_count} inliers, "
-        f"one in {second.world!r} with {second.inlier_count}"
+        f"poses in two scenes explain the photograph: one in {one!r} with {first.inlier_count} inliers, one in "
+        f"{other!r} with {second.inlier_count}"
     )
     rejection = Rejection(RejectionReason.AMBIGUOUS, message, decided, hypotheses=(first, second))
     return Verdict(best.pose, rejection, Doubt.TWO_PLACES)
