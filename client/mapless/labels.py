@@ -2,7 +2,7 @@
 
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from . import names
 
@@ -21,3 +21,15 @@ def check_labels(labels: Mapping[str, str]) -> dict[str, str]:
             bounds = f"1 to {MAX_LABEL_VALUE} characters, none of them a control character"
             raise ValueError(f"must have values of {bounds}, {name!r} has {names.shown(value)}")
     return dict(labels)
+
+
+def parse_labels(texts: Iterable[str]) -> dict[str, str]:
+    """Reads labels from texts NAME=VALUE; ValueError for another form, or two values of one name."""
+    labels = dict[str, str]()
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise ValueError(f"--label takes NAME=VALUE, such as site=a, not {text!r}")
+        if labels.setdefault(name, value) != value:
+            raise ValueError(f"--label {name} is given as {labels[name]!r} and as {value!r}: no scene has both")
+    return check_labels(labels)

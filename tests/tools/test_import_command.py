@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -93,6 +94,18 @@ def test_a_part_of_a_folder_with_a_prefix(server: RunningServer, client: Client,
     assert stored(client, scene) == ["east-p00", "east-p03", "east-p06", "p08", "p10"]
 
 
+def test_labels_are_added_to_those_of_the_scene(
+    server: RunningServer, client: Client, scene: str, folder: Path
+) -> None:
+    def labels_after(*flags: str) -> Mapping[str, str]:
+        assert run_import(server, folder, scene, "--skip-check", "--max", 2, *flags).exit_code == 0
+        return client.get_scene(scene).labels
+
+    assert labels_after("--label", "site=a", "--label", "floor=1") == {"site": "a", "floor": "1"}
+    assert labels_after("--label", "floor=2") == {"site": "a", "floor": "2"}
+    assert labels_after() == {"site": "a", "floor": "2"}
+
+
 def test_single_frames_are_refused_by_name_and_the_rest_is_in(
     server: RunningServer, client: Client, scene: str, folder: Path
 ) -> None:
@@ -144,6 +157,8 @@ def test_the_epipolar_error_of_rendered_photographs_is_printed(tmp_path: Path) -
         (("--stride", 0), "stride and max"),
         (("--intrinsics", "1,2,3"), "intrinsics must be fx,fy,cx,cy"),
         (("--id-prefix", "../"), "an id is"),
+        (("--label", "site"), "--label takes NAME=VALUE"),
+        (("--label", "site=a", "--label", "site=b"), "--label site is given as 'a' and as 'b'"),
         (("--parallel", 0), "--parallel is the number of messages in flight, 1 to 64, not 0"),
         (("--report", "no/such/folder/report.json"), "cannot be written"),
         (("--token-file", "none"), "cannot be read"),

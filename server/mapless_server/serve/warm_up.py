@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Camera, RigidTransform
-from mapless_server.engine.query import Caller, Photo, Query, Tier
+from mapless_server.engine.query import Caller, Photo, Query, SceneQuestion, Tier
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.method.features.extractors import FeatureExtractor
 from mapless_server.method.features.views import Photograph, PosedView
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions, StageContext
-from mapless_server.scenes import Choice, Narrowing
+from mapless_server.scenes import Choice, Narrowing, RankedReference
 from mapless_server.scenes.library import Loaded
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
@@ -145,6 +145,10 @@ class _RenderedReferences:
     def choose(self, *_: object) -> Choice:
         """See ReferenceSource."""
         raise NotImplementedError("the warm-up names its references")
+
+    def choose_among(self, *_: object) -> Sequence[tuple[SceneQuestion, Sequence[RankedReference]]]:
+        """See ReferenceSource."""
+        raise NotImplementedError("the warm-up has one scene")
 
     def sample(self, *_: object) -> Sequence[str]:
         """See ReferenceSource."""

@@ -114,6 +114,10 @@ def import_command(
             help="Bring the photographs into the world of the scene's references, by a similarity that fits matches.",
         ),
     ] = False,
+    label: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="Label of the scene, by which groups find it; may be repeated."),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="JSON file for the whole report.")] = None,
     data_dir: DataDir = None,
     *,
@@ -125,6 +129,7 @@ def import_command(
 
     Run it again to go on where it was cut off.
     """
+    from mapless.labels import parse_labels
     from mapless_server.settings import ConfigError
 
     from .formats import KeyframeOptions, ReadOptions
@@ -152,6 +157,7 @@ def import_command(
             check=not skip_check,
             align_to_scene=align_to_scene,
             parallel=parallel,
+            labels=parse_labels(label or ()),
         )
         settings = _settings(data_dir, connection)
         where = None if dry_run else connection

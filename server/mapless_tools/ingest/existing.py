@@ -1,8 +1,9 @@
 """The scene that an import fills, its references, and whether a frame is one of them."""
 
 import threading
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
+from types import MappingProxyType
 
 import numpy as np
 
@@ -120,17 +121,27 @@ class WrongUnit(Exception):
 
 
 def open_scene(
-    client: Client, scene: str, dataset: Dataset, chosen: Sequence[Frame], is_aligned: bool = False
+    client: Client,
+    scene: str,
+    dataset: Dataset,
+    chosen: Sequence[Frame],
+    is_aligned: bool = False,
+    labels: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Reference]:
     """Returns the references of a scene, which is created with the dataset's datum, down and unit if missing.
 
-    A scene without references gets the dataset's unit. WrongUnit if its references are in metres and the dataset is
-    not, or vice versa; unless it will be aligned with them, which gives their unit.
+    It gets the labels, beside those that it has. A scene without references gets the dataset's unit. WrongUnit if its
+    references are in metres and the dataset is not, or vice versa; unless it will be aligned with them, which gives
+    their unit.
     """
     is_arbitrary = not dataset.metric
     try:
         client.create_scene(
-            scene, datum=dataset.datum, down_in_world=dataset.down_in_world, arbitrary_unit=is_arbitrary
+            scene,
+            datum=dataset.datum,
+            down_in_world=dataset.down_in_world,
+            arbitrary_unit=is_arbitrary,
+            labels=labels,
         )
         return []
     except AlreadyExists:
@@ -140,6 +151,8 @@ def open_scene(
             there = client.get_scene(scene)
         except NotFound:
             raise error from None
+    if not labels.items() <= there.labels.items():
+        client.update_scene(scene, labels={**there.labels, **labels})
     existing = list(client.list_references(scene, page_size=1000))
     if (
         (existing and is_aligned)

@@ -1,7 +1,7 @@
 """An import: reads, selects, checks, compares with the scene, stores, and reports."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from mapless import Client, DeadlineExceeded, MaplessError, Reference, Unavailable
+from mapless.labels import check_labels
 from mapless.names import check_id
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_depth
@@ -57,6 +58,7 @@ class ImportOptions:
         check: whether to compare photographs with the poses, and with the scene's references, first.
         align_to_scene: whether to bring the frames into the world of the scene's references, by matches with them.
         parallel: number of messages in flight, 1 to 64; the server describes their photographs concurrently.
+        labels: labels that the scene gets, beside those that it has.
     """
 
     format: str = "auto"
@@ -69,8 +71,10 @@ class ImportOptions:
     check: bool = True
     align_to_scene: bool = False
     parallel: int = 3
+    labels: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        check_labels(self.labels)
         if self.split not in ("", "train", "test"):
             raise ValueError(f"split must be train or test, not {self.split!r}")
         if self.stride < 1 or (self.max_count is not None and self.max_count < 1):
@@ -224,7 +228,9 @@ def _store(report: ImportReport, options: ImportOptions, settings: Settings, con
     """Stores the chosen frames in the scene, which is created with the dataset's datum and down if missing."""
     try:
         with connected(connection, settings) as client, progress_bars() as progress:
-            existing = open_scene(client, report.scene, report.dataset, report.chosen, options.align_to_scene)
+            existing = open_scene(
+                client, report.scene, report.dataset, report.chosen, options.align_to_scene, options.labels
+            )
             if (options.check or options.align_to_scene) and not _fits_scene(
                 report, options.align_to_scene, client, existing, progress
             ):
