@@ -154,8 +154,8 @@ def same(first: Result, second: Result) -> bool:
 
 def measure(asked: Asked, folder: Folder, everything: Sequence[Folder], outside: int) -> Counts:
     """Asks the photographs of a folder in its scene, among all scenes, and among those of other places."""
-    counts, all_scenes = Counts(), [it.scene for it in everything]
-    others = [it for it in all_scenes if it not in folder.same_place]
+    counts, others = Counts(), [it.scene for it in everything if it.scene not in folder.same_place]
+    all_scenes = [folder.scene, *others]  # folders of one place count as one
     for frame in folder.photographs:
         asked.ask(frame, *all_scenes)
         named, named_s = asked.ask(frame, folder.scene)
@@ -166,7 +166,7 @@ def measure(asked: Asked, folder: Folder, everything: Sequence[Folder], outside:
         counts.right_named += is_named and is_right_answer(named, frame, folder)
         counts.right_among += is_among and is_right_answer(among, frame, folder)
         counts.same += (is_same := same(named, among))
-        counts.wrong_scene += is_among and among.scene_key not in folder.same_place
+        counts.wrong_scene += is_among and among.scene_key != folder.scene
         counts.named_s += named_s
         counts.among_s += among_s
         if not is_same:
@@ -181,10 +181,10 @@ def measure(asked: Asked, folder: Folder, everything: Sequence[Folder], outside:
 
 
 def is_right_answer(result: Result, frame: Frame, folder: Folder) -> bool:
-    """Whether the pose is right; one in another folder of the place counts as right."""
+    """Whether the pose is right."""
     outcome, support = result.answer.outcome, result.answer.support
     if not isinstance(outcome, Localization) or result.scene_key != folder.scene:
-        return result.scene_key in folder.same_place
+        return False
     off, off_deg = pose_error(frame.world_from_camera, outcome.world_from_camera)
     return is_right(off, off_deg, getattr(support, "distance_m", float)(), folder.metric)
 

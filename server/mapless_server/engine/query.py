@@ -165,12 +165,15 @@ class SceneQuestion:
     Attributes:
         scene_key: the scene.
         narrowing, priors, attributes: as of `Query`.
+        generation: a generation that the scene has reached; None if none is known. Whether references in memory are as
+            recent is then known without asking the store.
     """
 
     scene_key: SceneKey
     narrowing: Narrowing
     priors: Priors = NO_PRIORS
     attributes: SceneAttributes | None = None
+    generation: int | None = None
 
 
 @dataclass(frozen=True, eq=False)

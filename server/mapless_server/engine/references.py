@@ -139,8 +139,10 @@ class References:
 
     def _entries_of(self, question: SceneQuestion, context: StageContext) -> tuple[SceneQuestion, Entries] | None:
         """The references of one of several scenes; None, and a line in the log, if it cannot be read."""
+        scene_key, indexes = question.scene_key, self.retrievals[0].indexes
         try:
-            return question, self.retrievals[0].indexes.entries(question.scene_key, context)
+            entries = indexes.known(scene_key, question.generation)
+            return question, indexes.entries(scene_key, context) if entries is None else entries
         except (NotFound, DataLoss) as error:
             log.warning("scene %s is left out among several: %s", question.scene_key, error)
             return None

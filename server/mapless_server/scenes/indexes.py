@@ -91,6 +91,17 @@ class SceneIndexes:
                 for reference_id, key in undescribed:
                     self._describe(scene_key, cached, reference_id, key, context)
 
+    def known(self, scene_key: SceneKey, generation: int | None) -> Entries | None:
+        """The references of a scene in memory, if these are of a generation or a later one; else None.
+
+        None, too, where some have no descriptor. The store is not asked.
+        """
+        cached = None if generation is None else self._cached.get(scene_key)
+        if cached is None or generation is None or cached.index.generation < generation:
+            return None
+        entries = cached.index.entries()
+        return None if entries.undescribed() else entries
+
     def describe(self, scene_key: SceneKey, references: Sequence[tuple[str, str]], context: StageContext) -> None:
         """Describes those of these references, ids and keys, that have no descriptor, while the context has time.
 

@@ -38,7 +38,7 @@ class FoundScenes:
     @cached_property
     def questions(self) -> tuple[SceneQuestion, ...]:
         """The questions of a request without priors."""
-        return tuple(SceneQuestion(it.scene_key, ANYWHERE) for it in self.scenes)
+        return tuple(SceneQuestion(it.scene_key, ANYWHERE, generation=it.generation) for it in self.scenes)
 
     @cached_property
     def attributes(self) -> tuple[SceneAttributes, ...]:
@@ -184,7 +184,8 @@ class _ScenePriors:
             gravity = added.gravity or priors.gravity
             priors = replace(priors, position=added.position or priors.position, gravity=gravity)
             narrowing = replace(Narrowing.of(priors), position=narrowing.position, heading=narrowing.heading)
-        return SceneQuestion(scene.scene_key, narrowing, priors, known if is_converted or added else None)
+        used = known if is_converted or added else None
+        return SceneQuestion(scene.scene_key, narrowing, priors, used, scene.generation)
 
     def _given_in(self, index: int) -> tuple[Narrowing, Priors]:
         """What is given in one scene's world, in that of another; nothing if one of them has no datum."""
