@@ -23,13 +23,13 @@ def check_labels(labels: Mapping[str, str]) -> dict[str, str]:
     return dict(labels)
 
 
-def parse_labels(texts: Iterable[str]) -> dict[str, str]:
-    """Reads labels from texts NAME=VALUE; ValueError for another form, or two values of one name."""
+def parse_labels(texts: Iterable[str], flag: str = "--label") -> dict[str, str]:
+    """Reads labels from texts NAME=VALUE; ValueError, with the flag, for another form, or two values of one name."""
     labels = dict[str, str]()
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals and value):
-            raise ValueError(f"--label takes NAME=VALUE, such as site=a, not {text!r}")
+            raise ValueError(f"{flag} takes NAME=VALUE, such as site=a, not {text!r}")
         if labels.setdefault(name, value) != value:
-            raise ValueError(f"--label {name} is given as {labels[name]!r} and as {value!r}: no scene has both")
+            raise ValueError(f"{flag} {name} is given as {labels[name]!r} and as {value!r}: no scene has both")
     return check_labels(labels)

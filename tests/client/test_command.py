@@ -123,7 +123,7 @@ def test_contradicting_labels_are_wrong_usage(run: Run, scene: str) -> None:
     for arguments, message in (
         (["create", "new", "--label", "site=a", "--label", "site=b"], "--label site is given as 'a' and as 'b'"),
         (["update", scene, "--label", "site=a", "--forget", "labels"], "labels is given, and to be forgotten"),
-        (["create", "new", "--label", "site"], "'site' is not NAME=VALUE"),
+        (["create", "new", "--label", "site"], "--label takes NAME=VALUE, such as site=a, not 'site'"),
     ):
         code, _, error = run("scene", *arguments)
         assert code == 2

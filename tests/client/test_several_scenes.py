@@ -10,6 +10,7 @@ from support.servers import CAMERA, PHOTO
 from mapless import ConnectOptions, wire
 from mapless.calls.localization import localize
 from mapless.cli.arguments import make_parser
+from mapless.cli.localize import _group_of
 from mapless.cli.output import heading, line
 from mapless.diagnostics import Diagnostics
 from mapless.messages import answer_from_message
@@ -103,18 +104,24 @@ def test_the_table_of_a_folder_ends_with_scenes() -> None:
 @pytest.mark.parametrize(
     ("given", "scene", "scenes", "group"),
     [
-        ("hall photo.jpg", "hall", [], []),
-        ("hall --count 3 photo.jpg", "hall", [], []),
-        ("--group site-a photo.jpg", "", [], [("group", "site-a")]),
-        ("photo.jpg --group=site=a --group floor=2", "", [], [("site", "a"), ("floor", "2")]),
-        ("--scene hall photo.jpg --scene yard", "", ["hall", "yard"], []),
+        ("hall photo.jpg", "hall", [], None),
+        ("hall --count 3 photo.jpg", "hall", [], None),
+        ("--group site-a photo.jpg", "", [], {"group": "site-a"}),
+        ("photo.jpg --group=site=a --group floor=2", "", [], {"site": "a", "floor": "2"}),
+        ("--scene hall photo.jpg --scene yard", "", ["hall", "yard"], None),
     ],
 )
 def test_the_command_takes_a_scene_or_finds_it(
-    given: str, scene: str, scenes: list[str], group: list[tuple[str, str]]
+    given: str, scene: str, scenes: list[str], group: dict[str, str] | None
 ) -> None:
     parsed = make_parser().parse_args(["localize", *given.split()])
-    assert (parsed.scene, parsed.photo.name, parsed.scenes, parsed.group) == (scene, "photo.jpg", scenes, group)
+    assert (parsed.scene, parsed.photo.name, parsed.scenes, _group_of(parsed)) == (scene, "photo.jpg", scenes, group)
+
+
+@pytest.mark.parametrize("given", ["=a", "site=", "site=a --group site=b"])
+def test_a_group_of_no_label_is_refused(given: str) -> None:
+    with pytest.raises(ValueError, match="--group"):
+        _group_of(make_parser().parse_args(["localize", "photo.jpg", "--group", *given.split()]))
 
 
 @pytest.mark.parametrize(
@@ -122,7 +129,6 @@ def test_the_command_takes_a_scene_or_finds_it(
     [
         ("photo.jpg", "required: photo"),
         ("hall --anywhere photo.jpg", "SCENE is not taken together with --anywhere"),
-        ("--group =a photo.jpg", "is not NAME=VALUE"),
         ("--group a --anywhere photo.jpg", "not allowed with"),
     ],
 )

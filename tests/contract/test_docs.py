@@ -187,7 +187,7 @@ def test_the_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
             for name, world_from_camera in known["poses"].items():
                 pose_of = RigidTransform.from_matrix(world_from_camera)
                 client.add_reference("kitchen", NewReference(name, photo, known["camera"], pose_of))
-            client.update_scene("hall", down_in_world=(0, 0, -1))
+            client.update_scene("hall", down_in_world=(0, 0, -1), labels={"site": "a"})
             for program in others:
                 known["client"] = client
                 run(program.replace("localhost:50051", server.address), known)

@@ -83,6 +83,12 @@ def test_the_answer_is_the_one_with_its_scene_named(client: Client, where: dict[
     assert named.diagnostics.searched_scene_count == 1
 
 
+def test_a_group_on_the_earth_has_the_scenes_with_a_datum(client: Client) -> None:
+    assert found(client, group={}, with_datum=True).diagnostics.searched_scene_count == 2
+    with pytest.raises(NotFound, match="no scene with 'site=b, a datum'"):
+        client.localize(PHOTO, CAMERA, group={"site": "b"}, with_datum=True)
+
+
 def test_the_unit_is_that_of_the_scene_that_was_found(client: Client) -> None:
     answer = found(client, photograph(TRUE, papers=OTHERS[1]), group=SITE_A)
     assert (answer.scene, answer.arbitrary_unit) == ("scenes/doll", True)

@@ -204,7 +204,6 @@ async def test_scenes_and_versions_that_are_not_served(server: RunningServer) ->
         answers = [
             await gateway.geopose(gpp.request(), "/scenes/nowhere/geopose"),
             await gateway.geopose(gpp.request(), "/scenes/absent/geopose"),
-            await gateway.geopose(gpp.request(), "/geopose"),
             await gateway.geopose(gpp.request(), "/scenes/a..b/geopose"),
             await gateway.geopose(
                 gpp.request(), "/scenes/hall/geopose", accept="application/vnd.oscp+json; version=1.0;"
@@ -212,8 +211,31 @@ async def test_scenes_and_versions_that_are_not_served(server: RunningServer) ->
             await gateway.geopose(gpp.request(), "/nothing"),
             await requested(gateway.app, "PUT", "/geopose"),
         ]
-    assert [it.status for it in answers] == [409, 404, 404, 400, 406, 404, 405]
-    assert [it.json["error"]["reason"] for it in answers][:3] == ["NO_DATUM", "NOT_FOUND", "NO_SCENE"]
+    assert [it.status for it in answers] == [409, 404, 400, 406, 404, 405]
+    assert [it.json["error"]["reason"] for it in answers][:2] == ["NO_DATUM", "NOT_FOUND"]
+
+
+async def test_without_a_scene_it_is_found_among_those_on_the_earth(
+    server: RunningServer, asked: list[dict[str, Any]]
+) -> None:
+    """An earlier answer is a prior of the position then: a pose prior is given in the world of one scene."""
+    async with gateway_of(server.address, scene="") as gateway:
+        first = await gateway.geopose(gpp.request())
+        again = await gateway.geopose(gpp.request() | {"priorPoses": [first.json | {"timestamp": 1000 * time.time()}]})
+    assert (first.status, first.headers["x-mapless-scene"]) == (200, "scenes/hall")
+    assert [(it["group"], it["with_datum"]) for it in asked] == [({}, True)] * 2
+    prior = asked[1]["priors"].geo_position
+    assert (again.status, asked[1]["priors"].pose) == (200, None)
+    assert prior.latitude_deg == first.json["geopose"]["position"]["lat"]
+    assert prior.horizontal_sigma_m == pytest.approx(first.json["accuracy"]["position"], abs=10)
+
+
+async def test_a_group_of_the_gateway_has_its_labels(server: RunningServer) -> None:
+    async with gateway_of(server.address, scene="", group={"site": "x"}) as gateway:
+        answers = [await gateway.geopose(gpp.request()), await gateway.form(image=PHOTO, intrinsics=INTRINSICS)]
+        named = await gateway.form(image=PHOTO, intrinsics=INTRINSICS, request='{"scenes": ["scenes/nowhere"]}')
+    assert [(it.status, it.json["error"]["field"]) for it in answers] == [(404, "scene_group")] * 2
+    assert (named.status, named.json["scene"]) == (200, "scenes/nowhere")
 
 
 async def test_a_rejection_says_why_and_what_helps(server: RunningServer) -> None:

@@ -83,7 +83,7 @@ async def test_bad_forms_are_answered_with_what_and_where(server: RunningServer)
             "image": form(intrinsics=INTRINSICS, scene="hall"),
             "intrinsics": form(image=PHOTO, intrinsics='{"width": 3}', scene="hall"),
             "request": form(image=PHOTO, intrinsics=INTRINSICS, scene="hall", request="[" * 10_000),
-            "scene": form(image=PHOTO, intrinsics=INTRINSICS),
+            "scene": form(image=PHOTO, intrinsics=INTRINSICS, scene="a/b"),
             "photo": form(photo=PHOTO),
             "content-type": (b"x", JSON),
         }

@@ -35,6 +35,7 @@ async def _localize_request(
     *,
     scenes: Sequence[str] = (),
     group: Mapping[str, str] | None = None,
+    with_datum: bool = False,
     prior_scene: str = "",
     priors: Priors | None = None,
     intrinsics_uncertainty: IntrinsicsUncertainty | None = None,
@@ -69,6 +70,7 @@ async def _localize_request(
         references: the references to use, most similar first, at most 64; empty: the server chooses.
         scenes: up to 64 scenes, among which the server finds that of the photograph: `answer.scene`.
         group: labels by name that such scenes have, {"site": "a"}; {} for all scenes that the caller may read.
+        with_datum: whether only those scenes of `group` are meant that have a datum.
         prior_scene: with `scenes` or `group`, the one of them in whose world position, heading, pose and down_in_world
             of `priors` are given; the scene of the last answer, if the prior comes from it.
         priors: knowledge of the pose before the photograph is used, for example its position.
@@ -118,6 +120,8 @@ async def _localize_request(
         ),
     )
     _set_scenes(request, scene, scenes, group, prior_scene)
+    if with_datum:
+        request.scene_group.with_datum = True
     if references:
         request.references.extend(reference_names(scene, references))
     set_priors(request, priors or Priors())

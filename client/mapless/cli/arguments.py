@@ -11,7 +11,7 @@ from mapless_command.installation import how_to_install
 from ..client import Client
 from ..shortcut import default_address
 from . import commands, doctor
-from .parsing import COMMON_DEFAULTS, Command, Parser, add_common, all_parsers, label
+from .parsing import COMMON_DEFAULTS, Command, Parser, add_common, all_parsers
 from .photographs import COUNT_DEFAULT, MASK, add_depth, add_limits, add_localize, count
 
 DESCRIPTION = """\
@@ -129,7 +129,7 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
 
 
 def _add_labels(command: argparse.ArgumentParser, text: str) -> None:
-    command.add_argument("--label", action="append", default=[], type=label, metavar="NAME=VALUE", help=text)
+    command.add_argument("--label", action="append", default=[], metavar="NAME=VALUE", help=text)
 
 
 def _add_place(command: argparse.ArgumentParser) -> None:

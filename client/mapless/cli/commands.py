@@ -11,6 +11,7 @@ from ..cameras import read_camera, read_pose
 from ..client import Client
 from ..geodesy import Datum
 from ..geometry import Quaternion, RigidTransform
+from ..labels import parse_labels
 from ..lenses import lens_model_of
 from ..names import check_id
 from ..pixels import format_of_image
@@ -41,7 +42,7 @@ def create_scene(client: Client, arguments: argparse.Namespace) -> int:
         datum=datum,
         down_in_world=down,
         arbitrary_unit=is_arbitrary,
-        labels=_given_labels(arguments),
+        labels=parse_labels(arguments.label),
     )
     return show(arguments, scene, _scene_card(scene))
 
@@ -56,7 +57,7 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
     if arguments.unit is not None:
         changes["arbitrary_unit"] = arguments.unit == "arbitrary"
     if arguments.label:
-        changes["labels"] = _given_labels(arguments)
+        changes["labels"] = parse_labels(arguments.label)
     if both := [it for it in arguments.forget if changes[it] is not None]:
         raise ValueError(f"{both[0]} is given, and to be forgotten")
     if not changes:
@@ -108,21 +109,13 @@ def _unit(scene: Scene) -> str:
     return "arbitrary" if scene.arbitrary_unit else "m"
 
 
-def _given_labels(arguments: argparse.Namespace) -> dict[str, str]:
-    labels = dict[str, str]()
-    for name, value in arguments.label:
-        if labels.setdefault(name, value) != value:
-            raise ValueError(f"--label {name} is given as {labels[name]!r} and as {value!r}")
-    return labels
-
-
 def _labels(scene: Scene) -> str:
     return ", ".join(f"{name}={value}" for name, value in sorted(scene.labels.items()))
 
 
 def list_scenes(client: Client, arguments: argparse.Namespace) -> int:
     """Lists all scenes, or those with labels."""
-    scenes = list(client.list_scenes(labels=_given_labels(arguments)))
+    scenes = list(client.list_scenes(labels=parse_labels(arguments.label)))
     rows = [(it.scene_id, it.reference_count, _unit(it), _place(it.datum), _minute(it), _labels(it)) for it in scenes]
     head = "SCENE", "REFERENCES", "UNIT", "LATITUDE, LONGITUDE", "CREATED", "LABELS"
     return show(arguments, scenes, table(head, rows))

@@ -19,6 +19,7 @@ from ..client import Client
 from ..depth import DepthImage, DepthSensor
 from ..errors import InvalidArgument, MaplessError
 from ..geometry import Camera
+from ..labels import parse_labels
 from ..masks import find_mask, mask_name
 from ..priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from ..requests import ImageSource, IntrinsicsUncertainty, ReadoutDirection
@@ -223,7 +224,7 @@ def _answers(
     """Yields the answer; with --progressive, others may come first."""
     options: dict[str, Any] = {
         "scenes": arguments.scenes,
-        "group": dict(arguments.group) if arguments.group or arguments.anywhere else None,
+        "group": _group_of(arguments),
         "prior_scene": arguments.prior_scene,
         "priors": priors(arguments),
         "mask": mask,
@@ -244,6 +245,13 @@ def _answers(
         yield from client.localize_progressively(*photograph, **options)
     else:
         yield client.localize(*photograph, **options)
+
+
+def _group_of(arguments: argparse.Namespace) -> dict[str, str] | None:
+    """The labels of a group; a value alone is that of the label "group". None where no group is asked for."""
+    if not (arguments.group or arguments.anywhere):
+        return None
+    return parse_labels([it if "=" in it else f"group={it}" for it in arguments.group], "--group")
 
 
 def _row(photo: Photo, width: int, outcome: Outcome, as_json: bool, arguments: argparse.Namespace) -> str:

@@ -98,14 +98,6 @@ class Command(Parser):
         return namespace, left
 
 
-def label(text: str) -> tuple[str, str]:
-    """Reads a label, NAME=VALUE."""
-    name, equals, value = text.partition("=")
-    if not (name and equals and value):
-        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=VALUE, such as site=a")
-    return name, value
-
-
 def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
     """Yields a parser and the parsers of its commands."""
     yield parser

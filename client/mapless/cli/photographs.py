@@ -10,7 +10,7 @@ from mapless_command.installation import how_to_install
 from ..depth import DepthSensor
 from ..requests import ReadoutDirection
 from . import localize
-from .parsing import Command, Gone, label
+from .parsing import Command, Gone
 
 COUNT_DEFAULT = "(default: the server's)"
 
@@ -93,7 +93,7 @@ def _add_scenes(command: Command) -> None:
         "--scene", dest="scenes", action="append", default=[], metavar="SCENE", help="one of them; may be repeated"
     )
     several.add_argument(
-        "--group", action="append", default=[], type=_group_label, metavar="NAME=VALUE",
+        "--group", action="append", default=[], metavar="NAME=VALUE",
         help="those with this label, site=a, see `mapless scene update --label`; VALUE alone is group=VALUE; may be "
         "repeated, for those with all of the labels",
     )  # fmt: skip
@@ -104,10 +104,6 @@ def _add_scenes(command: Command) -> None:
         metavar="SCENE",
         help="the one in whose world --near, --looking and --pose-prior are given",
     )
-
-
-def _group_label(text: str) -> tuple[str, str]:
-    return label(text if "=" in text else f"group={text}")
 
 
 def count(text: str) -> int:

@@ -265,7 +265,7 @@ class LocalizeRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., references: _Optional[_Iterable[str]] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., scenes: _Optional[_Iterable[str]] = ..., scene_group: _Optional[_Union[SceneGroup, _Mapping]] = ..., prior_scene: _Optional[str] = ...) -> None: ...
 
 class SceneGroup(_message.Message):
-    __slots__ = ("labels",)
+    __slots__ = ("labels", "with_datum")
     class LabelsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -274,8 +274,10 @@ class SceneGroup(_message.Message):
         value: str
         def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
     LABELS_FIELD_NUMBER: _ClassVar[int]
+    WITH_DATUM_FIELD_NUMBER: _ClassVar[int]
     labels: _containers.ScalarMap[str, str]
-    def __init__(self, labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    with_datum: bool
+    def __init__(self, labels: _Optional[_Mapping[str, str]] = ..., with_datum: bool = ...) -> None: ...
 
 class IntrinsicsUncertainty(_message.Message):
     __slots__ = ("focal_sigma_px", "principal_sigma_px", "k1_sigma", "readout_s", "readout_direction", "speed_m_per_s", "turn_deg_per_s")

@@ -23,7 +23,7 @@ class SceneFinder:
     def __init__(self, store: Store, reach: Reach) -> None:
         self._store = store
         self._reach = reach
-        self._groups: LruCache[FoundScenes] = LruCache(CACHED_SCENES, keeps_latest=True)
+        self._groups: LruCache[tuple[object, FoundScenes]] = LruCache(CACHED_SCENES, keeps_latest=True)
 
     def find(self, request: pb.LocalizeRequest, principal: Principal) -> FoundScenes:
         """The scenes that a request lists, or those of its group that are within the caller's reach.
@@ -33,7 +33,14 @@ class SceneFinder:
         """
         if request.scenes:
             return self._named(request, principal)
-        return self._group(labels_from_message(request.scene_group.labels, "scene_group.labels"), principal)
+        labels = labels_from_message(request.scene_group.labels, "scene_group.labels")
+        found = self._group(labels, request.scene_group.with_datum, principal)
+        if not found.scenes:
+            having = [f"{name}={value}" for name, value in labels.items()]
+            having += ["a datum"] if request.scene_group.with_datum else []
+            shown = f" with {names.shown(', '.join(having))}" if having else ""
+            raise NotFound(f"there is no scene{shown}", field="scene_group")
+        return found
 
     def _named(self, request: pb.LocalizeRequest, principal: Principal) -> FoundScenes:
         listed = scene_keys_from_message(request, principal.tenant)
@@ -45,14 +52,13 @@ class SceneFinder:
             raise NotFound(f"there is no scene {scene_id!r}", field=field, resource=names.scene_name(scene_id))
         return FoundScenes(found.found)
 
-    def _group(self, labels: Mapping[str, str], principal: Principal) -> FoundScenes:
+    def _group(self, labels: Mapping[str, str], with_datum: bool, principal: Principal) -> FoundScenes:
         scenes = self._store.find_scenes(principal.tenant, labels, principal.limit)
-        if not scenes:
-            having = names.shown(", ".join(f"{name}={value}" for name, value in labels.items()))
-            raise NotFound(f"there is no scene with {having}" if labels else "there is no scene", field="scene_group")
-        name = principal.tenant, frozenset(labels.items()), principal.limit
-        known = self._groups.get(name)
-        if known is None or known.scenes is not scenes:
+        name = principal.tenant, frozenset(labels.items()), with_datum, principal.limit
+        made_of, known = self._groups.get(name) or (None, None)
+        if known is None or made_of is not scenes:
             known = FoundScenes(scenes)
-            self._groups.put(name, known, len(scenes))
+            if with_datum:
+                known = FoundScenes([it for it, its in zip(scenes, known.attributes, strict=True) if its.datum])
+            self._groups.put(name, (scenes, known), len(scenes))
         return known

@@ -1,7 +1,7 @@
 """The gateway's HTTP interface: the paths and their handlers."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
@@ -36,16 +36,27 @@ _SENT_HEADERS = (
     "x-user-agent",
 )
 """Headers that browsers may send besides those that they always may."""
-_READ_HEADERS = ("grpc-message", "grpc-status", "grpc-status-details-bin", "retry-after", "x-request-id")
+_READ_HEADERS = (
+    "grpc-message",
+    "grpc-status",
+    "grpc-status-details-bin",
+    "retry-after",
+    "x-mapless-scene",
+    "x-request-id",
+)
 _PREFLIGHT_S = 7200
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class GatewayOptions:
-    """Options of the gateway: the scene of requests that name none, if any, and a folder of pages for "/"."""
+    """Options of the gateway: where requests that name no scene are localized, and a folder of pages for "/".
+
+    That is a scene, or without one all scenes with these labels; by the GeoPose Protocol only those with a datum.
+    """
 
     scene: str = ""
+    group: Mapping[str, str] = field(default_factory=dict)
     pages: Path | None = None
     guard: GuardOptions = field(default_factory=GuardOptions)
 
@@ -123,9 +134,10 @@ class _Handlers:
             raise Failure(str(error), 401, reason="UNAUTHENTICATED", field="authorization") from None
 
     def _scene_of(self, request: Request) -> str:
+        """The name of the scene of a request; empty for any of the gateway's group."""
         scene = request.path_params.get("scene", self.options.scene)
         if not scene:
-            raise Failure("this gateway has no scene of its own: use /scenes/SCENE/geopose", 404, reason="NO_SCENE")
+            return ""
         try:
             parse_scene_name(name := scene_name(scene))
         except ValueError as error:
@@ -143,8 +155,8 @@ class _Handlers:
         geopose.check_version(request.headers.get("accept", ""))
         client, scene = self._client_for(request), self._scene_of(request)
         body = b"".join([part async for part in request.stream()])  # `request.body()` would keep it
-        datum = (await client.get_scene(scene)).datum
-        if datum is None:
+        datum = (await client.get_scene(scene)).datum if scene else None
+        if scene and datum is None:
             raise Failure(
                 f"{scene} has no datum, so its poses have no place on the Earth", 409, reason="NO_DATUM", field="scene"
             )
@@ -155,6 +167,8 @@ class _Handlers:
                 photograph.image,
                 photograph.camera,
                 scene,
+                group=None if scene else self.options.group,
+                with_datum=not scene,
                 priors=photograph.priors,
                 confidential=photograph.is_confidential,
             )
@@ -167,12 +181,18 @@ class _Handlers:
             request_id = answer.diagnostics.request_id
             raise Failure(answer.message, 422, reason=answer.reason, hint=hint, request_id=request_id)
         response = geopose.response_to(photograph, answer)
-        return JSONResponse(response, media_type=geopose.MEDIA_TYPE)
+        return JSONResponse(response, media_type=geopose.MEDIA_TYPE, headers={"x-mapless-scene": answer.scene})
 
     @_handler
     async def localize(self, request: Request) -> Response:
         client = self._client_for(request)
-        asked = await plain.read_form(request.headers, request.stream(), self.options.scene)
+        asked = await plain.read_form(request.headers, request.stream())
+        if not (asked.scene or asked.scenes or asked.HasField("scene_group")):
+            if self.options.scene:
+                asked.scene = scene_name(self.options.scene)
+            else:
+                asked.scene_group.SetInParent()
+                asked.scene_group.labels.update(self.options.group)
         response = await _while_connected(request, client.call("Localize", asked, lambda it: it))
         return JSONResponse(await asyncio.to_thread(plain.to_json, response))
 

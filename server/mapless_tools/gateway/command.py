@@ -12,6 +12,13 @@ from mapless_tools.connection import Connection, with_flags
 @with_flags
 def gateway_command(
     scene: Annotated[str, typer.Option(help="Id of the scene of requests that name none.")] = "",
+    group: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Label of the scenes among which that of requests that name none is found, NAME=VALUE; may be "
+            "repeated. Without it and without --scene: all scenes."
+        ),
+    ] = None,
     host: Annotated[str, typer.Option(help="Address that it listens on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 takes any free one.")] = 8080,
     allow_origin: Annotated[
@@ -34,6 +41,7 @@ def gateway_command(
     A token given here is used for requests of the GeoPose Protocol and of the form that have none of their own, never
     for the calls of browsers.
     """
+    from mapless.labels import parse_labels
     from mapless_server.serve.libraries import configure_libraries
     from mapless_server.serve.signals import terminable
     from mapless_server.settings import load_settings
@@ -53,7 +61,10 @@ def gateway_command(
             raise ValueError(
                 f"--pages {pages} holds no index.html; in client/web, build it by npm install && npm run build"
             )
-        options = GatewayOptions(scene, pages, guard)
+        if scene and group:
+            raise ValueError("--scene and --group exclude each other")
+        labels = parse_labels(group or (), "--group")
+        options = GatewayOptions(scene, labels, pages, guard)
         with terminable(), reachable(connection, settings) as (server, connect):
             if not connection.address:
                 print(f"a server was started at {server}", file=sys.stderr)

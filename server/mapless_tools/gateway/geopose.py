@@ -76,8 +76,8 @@ def check_version(accept: str) -> None:
                 )
 
 
-def read(body: bytes, datum: Datum) -> Photograph:
-    """Reads the photograph of a body, for a scene with this datum; Failure names what is wrong, and where."""
+def read(body: bytes, datum: Datum | None) -> Photograph:
+    """Reads the photograph of a body, for a scene with this datum or any; Failure names what is wrong, and where."""
     return photograph_of(read_request(body), datum)
 
 
@@ -94,8 +94,11 @@ def read_request(body: bytes) -> Request:
         raise Failure(f"{where or 'the body'}: {first['msg']}", field=where) from None
 
 
-def photograph_of(request: Request, datum: Datum, now_s: float | None = None) -> Photograph:
-    """Converts a request for a scene with this datum; Failure names what is wrong, and where."""
+def photograph_of(request: Request, datum: Datum | None, now_s: float | None = None) -> Photograph:
+    """Converts a request for a scene with this datum, or for any of several scenes; Failure names what is wrong.
+
+    A pose prior is given in the world of a scene: without one, an earlier pose is a prior of the position alone.
+    """
     readings, now_ms = request.sensorReadings, 1000 * (time.time() if now_s is None else now_s)
     _check_past(request.timestamp, now_ms, "timestamp")
     cameras = [(i, it) for i, it in enumerate(readings.cameraReadings) if it.imageFormat.upper() != "DEPTH"]
@@ -108,7 +111,10 @@ def photograph_of(request: Request, datum: Datum, now_s: float | None = None) ->
     image, (width_px, height_px) = _image_of(reading, where)
     camera = _camera_of(reading.params, width_px, height_px, f"{where}.params")
     geo, geo_field = _position_prior(readings.geolocationReadings, taken_ms, now_ms)
-    pose, pose_field = _pose_prior(request.priorPoses, taken_ms, now_ms, datum)
+    earlier = _earlier_pose(request.priorPoses, taken_ms, now_ms)
+    pose, pose_field = (None, "") if earlier is None or datum is None else (earlier.prior(datum), earlier.field)
+    if earlier is not None and datum is None and (geo is None or earlier.sigma_m < geo.horizontal_sigma_m):
+        geo, geo_field = earlier.position_prior(), earlier.field
     return Photograph(
         request.id,
         taken_ms,
@@ -221,28 +227,43 @@ def _position_prior(
     return prior, f"sensorReadings.geolocationReadings[{i}]"
 
 
-def _pose_prior(
-    earlier: Sequence[Response], taken_ms: float, now_ms: float, datum: Datum
-) -> tuple[PosePrior | None, str]:
-    """The prior of the newest earlier response, and its field; less certain for each second that has passed."""
+@dataclass(frozen=True, eq=False)
+class _EarlierPose:
+    """The pose of an earlier response, with the standard deviations that it has by now, and its path in the request."""
+
+    pose: GeoPose
+    sigma_m: float
+    sigma_deg: float
+    field: str
+
+    def prior(self, datum: Datum) -> PosePrior:
+        """The prior in the world of a scene with this datum."""
+        return PosePrior.from_sigmas(pose_from_geopose(self.pose, datum), self.sigma_m, self.sigma_deg)
+
+    def position_prior(self) -> GeoPositionPrior:
+        """The prior of the position, in any scene with a datum."""
+        return GeoPositionPrior(self.pose.lat, self.pose.lon, self.sigma_m, self.pose.h, self.sigma_m)
+
+
+def _earlier_pose(earlier: Sequence[Response], taken_ms: float, now_ms: float) -> _EarlierPose | None:
+    """The newest earlier response, less certain for each second that has passed; None if it says nothing any more."""
     for i, it in enumerate(earlier):
         _check_past(it.timestamp, now_ms, f"priorPoses[{i}].timestamp")
     if not earlier:
-        return None, ""
+        return None
     i = max(range(len(earlier)), key=lambda i: earlier[i].timestamp)
     newest, where = earlier[i], f"priorPoses[{i}]"
     age_s = abs(taken_ms - newest.timestamp) / 1000
     accuracy = newest.accuracy
     if age_s > _OLD_S or not (0 <= accuracy.position <= _MAX_SIGMA_M and 0 <= accuracy.orientation <= 180):
-        return None, ""
+        return None
     try:
         pose = GeoPose.from_json(newest.geopose.model_dump())
-        world_from_camera = pose_from_geopose(pose, datum)
     except ValueError as error:
         raise Failure(str(error), field=f"{where}.geopose") from None
     sigma_m = max(math.hypot(accuracy.position, _WALK_M_PER_S * age_s), 0.01)
     sigma_deg = min(max(math.hypot(accuracy.orientation, _TURN_DEG_PER_S * age_s), 0.1), 180.0)
-    return PosePrior.from_sigmas(world_from_camera, sigma_m, sigma_deg), where
+    return _EarlierPose(pose, sigma_m, sigma_deg, where)
 
 
 def _check_past(timestamp_ms: float, now_ms: float, field: str) -> None:

@@ -17,8 +17,8 @@ FIELDS = ("image", "intrinsics", "scene", "request", "mask")
 _MAX_PART_BYTES = 2**20
 
 
-async def read_form(headers: Headers, body: AsyncGenerator[bytes, None], default_scene: str) -> pb.LocalizeRequest:
-    """Reads the request that a form describes; Failure names the wrong field. The default scene may be empty."""
+async def read_form(headers: Headers, body: AsyncGenerator[bytes, None]) -> pb.LocalizeRequest:
+    """Reads the request that a form describes, perhaps without a scene; Failure names the wrong field."""
     if not headers.get("content-type", "").startswith("multipart/form-data"):
         example = "curl -F image=@photo.jpg"
         raise Failure(f"must be multipart/form-data, as of {example}", 415, field="content-type")
@@ -32,10 +32,9 @@ async def read_form(headers: Headers, body: AsyncGenerator[bytes, None], default
         raise Failure("is missing or empty", field="image")
     if "mask" in parts:
         request.mask = parts["mask"]
-    scene = parts["scene"].decode(errors="replace") if "scene" in parts else request.scene or default_scene
-    if not scene:
-        raise Failure("is missing, and the gateway has none of its own", field="scene")
-    request.scene = scene_name(scene)
+    scene = parts["scene"].decode(errors="replace") if "scene" in parts else request.scene
+    if scene:
+        request.scene = scene_name(scene)
     return request
 
 
