@@ -30,13 +30,13 @@ class Reach:
         return await self._key(call.principal, scene_id), reference_id
 
     async def _key(self, caller: Principal, scene_id: str) -> SceneKey:
-        limit = caller.limit
-        if limit is None or scene_id in limit.scene_ids:
-            return key_of(caller.tenant, scene_id)
-        if not limit.labels:
-            return key_of(NOWHERE, scene_id)
-        (key,) = await asyncio.to_thread(self.keys, caller, [scene_id])
-        return key
+        tenant, limit = caller.tenant, caller.limit
+        if limit is None:
+            return key_of(tenant, scene_id)
+        are_within = self._store.recall_within(tenant, [scene_id], limit)
+        if are_within is None:
+            are_within = await asyncio.to_thread(self._store.find_within, tenant, [scene_id], limit)
+        return key_of(tenant if scene_id in are_within else NOWHERE, scene_id)
 
     def keys(self, caller: Principal, scene_ids: Sequence[str]) -> tuple[SceneKey, ...]:
         """The keys of up to 64 scenes, by ids, in their order; may read the database."""

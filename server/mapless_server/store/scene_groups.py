@@ -74,19 +74,26 @@ class SceneGroups:
 
         A scene that does not exist and one without the labels take the same time.
         """
-        named = limit.scene_ids.intersection(scene_ids)
-        keys = tuple(sorted(key_of(tenant, it) for it in scene_ids if it not in named))
-        if not keys or not limit.labels:
-            return named
-        before = self._labelled.get((keys, limit.labels))
-        if before is not None and before[0] is state and not self._database.is_shared:
-            return named | before[1]
+        known = self.recall_within(tenant, scene_ids, limit, state)
+        if known is not None:
+            return known
+        keys = _unnamed(tenant, scene_ids, limit)
         with self._database.read() as connection:
             found = connection.execute(queries.select_labelled(keys, limit.labels)).scalars()
             labelled = frozenset(map(scene_id_of, found))
         if labelled:
             self._labelled.put((keys, limit.labels), (state, labelled), NAME_BYTES * (1 + len(keys)))
-        return named | labelled
+        return labelled | limit.scene_ids.intersection(scene_ids)
+
+    def recall_within(
+        self, tenant: str, scene_ids: Collection[str], limit: SceneLimit, state: object
+    ) -> frozenset[str] | None:
+        """The same without asking the database; None if it must be asked."""
+        named, keys = limit.scene_ids.intersection(scene_ids), _unnamed(tenant, scene_ids, limit)
+        if not keys:
+            return named
+        before = None if self._database.is_shared else self._labelled.get((keys, limit.labels))
+        return named | before[1] if before is not None and before[0] is state else None
 
     def _look_up(self, name: Hashable, statement: Callable[[], Select[Any]], state: object) -> tuple[GroupedScene, ...]:
         before = self._found.get(name)
@@ -102,6 +109,13 @@ class SceneGroups:
         if found:  # what is not there may be anything that a caller makes up
             self._found.put(name, (state, found), SCENE_BYTES * (1 + len(found)))
         return found
+
+
+def _unnamed(tenant: str, scene_ids: Collection[str], limit: SceneLimit) -> tuple[SceneKey, ...]:
+    """Keys of the scenes whose labels decide whether they are within a limit."""
+    if not limit.labels:
+        return ()
+    return tuple(sorted(key_of(tenant, it) for it in scene_ids if it not in limit.scene_ids))
 
 
 def _same_or_new(known: GroupedScene | None, row: Row[Any]) -> GroupedScene:

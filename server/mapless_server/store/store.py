@@ -154,6 +154,10 @@ class Store(StoreReader):
         """The ids of up to 64 that the limit names, or whose scenes have its labels; cached as of `find_scenes`."""
         return self._groups.find_within(tenant, scene_ids, limit, self._state)
 
+    def recall_within(self, tenant: str, scene_ids: Collection[str], limit: SceneLimit) -> frozenset[str] | None:
+        """`find_within` at once, in microseconds; None if the database must be asked."""
+        return self._groups.recall_within(tenant, scene_ids, limit, self._state)
+
     @observed
     def create_scene(
         self,
