@@ -308,3 +308,8 @@ def test_gravity_turns_a_photograph_among_scenes_as_in_one(rooms: Rooms, scene: 
     found = rooms.ask(image, HERE, THERE, priors=priors, camera=camera)
     assert isinstance(found.answer.outcome, Localization)
     assert content(found) == content(rooms.ask(image, scene, priors=priors, camera=camera))
+
+
+def test_scenes_are_chosen_in_a_stage_of_their_own(rooms: Rooms) -> None:
+    seconds = rooms.ask(photograph(TRUE), HERE, THERE).stage_seconds
+    assert {"decode", "features", "retrieval", "scenes", "shortlist"} <= seconds.keys()

@@ -10,6 +10,7 @@ What is wrong with one scene must not cost the answer from another: a scene that
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
@@ -18,12 +19,13 @@ from mapless_server.engine.search import Search
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method import ladder
 from mapless_server.method.features.rolls import LEAST_AGREEMENT, similarity_of
-from mapless_server.method.features.views import PosedView
+from mapless_server.method.features.views import Matches, PosedView, View
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.judge.decide import Verdict
 from mapless_server.method.judge.hypothesis import Attempt, Doubt, Found, Hypothesis
 from mapless_server.method.judge.worlds import World, decide_among
-from mapless_server.method.promise import PromiseOptions
+from mapless_server.method.pairs.correspond import Compared
+from mapless_server.method.promise import PROMISE, PromiseOptions
 from mapless_server.scenes import RankedReference
 from mapless_server.scenes.library import FeaturesMissing
 from mapless_server.security import scene_id_of
@@ -48,12 +50,14 @@ def with_scenes(search: Search, tier: Tier) -> Search:
     found, search = _chosen(search, tier)
     if not found:
         raise SceneMadeAnew
-    resembling = [it for it in found if it[1]]
-    if len(resembling) < 2:
-        ranking = tuple(_ranked(*it) for it in resembling or found[:1])
-    else:
-        ranking = _by_matches(search, resembling, tier) or (_ranked(*resembling[0]),)
-    return search.but(group=replace(group, ranking=ranking, searched_count=len(found))).entered(0)
+    resembling, compared = [it for it in found if it[1]], None
+    ranking = tuple(_ranked(*it) for it in resembling or found[:1])
+    if len(resembling) > 1:
+        views = search.views.in_form(RasterForm(max_pixels=tier.max_pixels))
+        compared = Compared(views.view(tier.extractor, search.context))
+        ranking = _by_matches(search, resembling, tier, compared) or ranking
+    group = replace(group, ranking=ranking, searched_count=len(found), compared=compared)
+    return search.but(group=group).entered(0).but(spent_s=search.seconds(tier.features))
 
 
 def _chosen(search: Search, tier: Tier) -> tuple[Sequence[Chosen], Search]:
@@ -76,20 +80,44 @@ def _chosen(search: Search, tier: Tier) -> tuple[Sequence[Chosen], Search]:
     return found, search
 
 
-def _by_matches(search: Search, found: Sequence[Chosen], tier: Tier) -> tuple[RankedScene, ...]:
-    """The scenes by the agreement of the photograph's matches with their references, and by similarity."""
+def _by_matches(search: Search, found: Sequence[Chosen], tier: Tier, compared: Compared) -> tuple[RankedScene, ...]:
+    """The scenes by the agreement of the photograph's matches with their references, and by similarity.
+
+    Those of a sample of its keypoints suffice if they agree with the best scene's. Of the others all keypoints count
+    where the sample's matches may agree, since it is said of them whether they do.
+    """
+    matcher, check = tier.pipeline.matcher, search.context.check
     loaded = [(it, references) for it in found if (references := _loaded(search, it, tier))]
-    views = search.views.in_form(RasterForm(max_pixels=tier.max_pixels))
-    view, everything = views.view(tier.extractor, search.context), [it for _, some in loaded for it in some]
+    everything = [it for _, some in loaded for it in some]
     with search.context.stage("scenes"):
-        matches = iter(tier.pipeline.matcher.match_quickly(view, everything, search.context.check))
-        ranked = []
-        for (question, chosen), references in loaded:
-            pairs = [(reference, next(matches)) for reference in references]
-            similar = [similarity_of(view, reference.view, them) for reference, them in pairs]
-            agreement = choosing.agreement_of(similar, references, is_enough=True)
-            ranked.append(_ranked(question, chosen, max(len(them) for _, them in pairs), agreement))
+        sample, step = matcher.match_sample(compared, everything, check)
+        ranked = _in_order(_agreements(loaded, compared.query, sample, step))
+        if not ranked or step == 1:
+            return ranked
+        is_clear = ranked[0].agreement >= LEAST_AGREEMENT
+        unclear = [it for it in ranked[int(is_clear) :] if not is_clear or it.agreement >= PROMISE.agreement]
+        again = {it.question.scene_key for it in unclear}
+        some = [it for it in loaded if it[0][0].scene_key in again]
+        matches = matcher.match_compared(compared, [it for _, them in some for it in them], check)
+        known = [it for it in ranked if it.question.scene_key not in again]
+        return _in_order([*known, *_agreements(some, compared.query, matches, 1)])
+
+
+def _in_order(ranked: Sequence[RankedScene]) -> tuple[RankedScene, ...]:
     return tuple(sorted(ranked, key=lambda it: (-it.agreement, -it.similarity)))
+
+
+def _agreements(
+    loaded: Sequence[tuple[Chosen, tuple[PosedView, ...]]], view: View, matches: Sequence[Matches], step: int
+) -> list[RankedScene]:
+    """The scenes with the agreement of matches of one in so many keypoints; that of all is larger by its root."""
+    ranked, rest = [], iter(matches)
+    for (question, chosen), references in loaded:
+        pairs = [(reference, next(rest)) for reference in references]
+        similar = [similarity_of(view, reference.view, them) for reference, them in pairs]
+        agreement = math.sqrt(step) * choosing.agreement_of(similar, references, is_enough=True)
+        ranked.append(_ranked(question, chosen, step * max(len(them) for _, them in pairs), agreement))
+    return ranked
 
 
 def _loaded(search: Search, chosen: Chosen, tier: Tier) -> tuple[PosedView, ...]:

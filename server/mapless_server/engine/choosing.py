@@ -303,7 +303,8 @@ def _chosen(search: Search, views: QueryViews, tier: Tier, any_roll: int | None)
 
     with context.stage("shortlist"):
         matcher = tier.pipeline.matcher
-        matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check)
+        known = None if search.group is None else search.group.compared_with(view)
+        matches = matcher.match_best(view, shortlist, query.reference_count, choose, context.check, known)
     chosen, query_matches = tuple(shortlist[i] for i in matches), tuple(matches.values())
     return Material(search.attempt.basis, views, view, chosen, scene, attributes, choice, query_matches)
 

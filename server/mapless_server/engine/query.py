@@ -315,7 +315,8 @@ class SceneTried:
         scene_key: the scene.
         reference_count: number of these references.
         similarity: largest similarity of one of them, see `RankedReference`.
-        match_count: most matches of the photograph with one of them; 0 where no other scene had any, which needs none.
+        match_count: most matches of the photograph with one of them, estimated where a sample of its keypoints shows
+            enough; 0 where no other scene has such references.
         attempted: whether a pose was looked for in the scene.
     """
 

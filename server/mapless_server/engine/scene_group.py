@@ -11,6 +11,9 @@ from mapless_server.method.judge.hypothesis import Attempt, Where
 from .query import Query, SceneQuestion, SceneTried
 
 if TYPE_CHECKING:
+    from mapless_server.method.features.views import View
+    from mapless_server.method.pairs.correspond import Compared
+
     from .photo_views import QueryViews
 
 SCENES = 2
@@ -44,6 +47,7 @@ class SceneGroup:
         ranking: the scenes with references that resemble the photograph, the best first; empty until they are found.
         searched_count: number of scenes in which references were looked for.
         left_out: ranks of the scenes that could not be read.
+        compared: comparisons of the photograph with references, by which the scenes were ranked; None without any.
     """
 
     query: Query
@@ -51,6 +55,11 @@ class SceneGroup:
     ranking: tuple[RankedScene, ...] = ()
     searched_count: int = 1
     left_out: frozenset[int] = frozenset()
+    compared: Compared | None = None
+
+    def compared_with(self, view: View) -> Compared | None:
+        """The comparisons, if they are of this view."""
+        return self.compared if self.compared is not None and self.compared.query is view else None
 
     def next_scene(self, tried: Collection[Attempt]) -> int | None:
         """Rank of the scene that is tried next, after these attempts; None if none is."""

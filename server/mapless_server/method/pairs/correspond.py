@@ -8,7 +8,7 @@ of the queries: `PairMatching`. What depends on the references alone is cached f
 
 import time
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,10 +24,11 @@ from ..features.matching import (
     NearestNeighbours,
     PairMatching,
     QueryMatching,
+    RowMaxima,
     SharedThreads,
 )
 from ..features.tracks import keypoint_offsets
-from ..features.views import Matches, PosedView, ReferenceErrors, View
+from ..features.views import Features, Matches, PosedView, ReferenceErrors, View
 from .pair import Matching, PairKey, PairMatches, ReferencePairs, in_order
 from .stationary import IgnoredKeypoints, StationaryOptions, without_ignored
 
@@ -125,6 +126,23 @@ def without_fixed(
     )
     before, after = (len(np.unique(np.concatenate(it)[:, 0])) for it in (query_matches, kept))
     return of_pairs, kept, before - after
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """The comparisons of a query's keypoints with references so far, by their keys, so that none is made twice.
+
+    Attributes:
+        query: the query, whose features are compared.
+        sampled: those of a sample of its keypoints.
+        rest: those of the others.
+        matches: of a `QueryMatching` that compares no keypoints one by one, the matches.
+    """
+
+    query: View
+    sampled: dict[str, RowMaxima] = field(default_factory=dict)
+    rest: dict[str, RowMaxima] = field(default_factory=dict)
+    matches: dict[str, Matches] = field(default_factory=dict)
 
 
 _PAIRS_THAT_COUNT = 10
@@ -255,6 +273,7 @@ class Matcher:
         count: int,
         choose: Callable[[Sequence[int], Sequence[int]], list[int]],
         check: Callable[[], None] = lambda: None,
+        compared: Compared | None = None,
     ) -> dict[int, Matches]:
         """Matches the query with those of many references that are chosen for it, as `match_quickly` does.
 
@@ -267,25 +286,91 @@ class Matcher:
             count: how many are wanted.
             choose: returns the indices of these, in order, from indices of references and their numbers of matches.
             check: as in `correspond`.
+            compared: comparisons of the query that were made before; those made now are added.
 
         Returns:
             Index of each chosen reference, in order, and its matches.
         """
         candidates: Sequence[int] = range(len(references))
         if len(references) > count and isinstance(self._query_matching, NearestNeighbours):
-            step, compare, ratio = self.options.sampled_share, self._query_matching.compare, self._query_matching.ratio
-            sampled = compare(query.features.every(step), references, check)
+            ratio = self._query_matching.ratio
+            sampled = self._sampled(query, references, check, compared)
             counts = [len(it.matches(ratio)) for it in sampled]
             chosen = choose(candidates, counts)
             if sum(counts[i] for i in chosen) >= self.options.enough_sampled * len(chosen):
                 candidates = chosen
-            rest = compare(query.features.but_every(step), [references[i] for i in candidates], check)
-            of_all = (it.with_every(step, sampled[i]) for i, it in zip(candidates, rest, strict=True))
-            matches: Sequence[Matches] = [it.matches(ratio) for it in of_all]
+            some = [references[i] for i in candidates]
+            matches = self._completed(query, some, [sampled[i] for i in candidates], check, compared)
+        elif compared is not None:
+            matches = self.match_compared(compared, references, check)
         else:
             matches = self.match_quickly(query, references, check)
         found = dict(zip(candidates, matches, strict=True))
         return {i: found[i] for i in choose(candidates, [len(it) for it in matches])}
+
+    def match_sample(
+        self, compared: Compared, references: Sequence[PosedView], check: Callable[[], None]
+    ) -> tuple[Sequence[Matches], int]:
+        """Finds matches of a sample of a query's keypoints, one in so many: of all of them where that costs as much."""
+        if not isinstance(self._query_matching, NearestNeighbours):
+            return self.match_compared(compared, references, check), 1
+        step, ratio = self.options.sampled_share, self._query_matching.ratio
+        found = (it.matches(ratio) for it in self._sampled(compared.query, references, check, compared))
+        return [it * np.array([step, 1], np.int32) for it in found], step
+
+    def match_compared(
+        self, compared: Compared, references: Sequence[PosedView], check: Callable[[], None]
+    ) -> Sequence[Matches]:
+        """Finds the matches that `match_quickly` finds, with those comparisons that were made before."""
+        if isinstance(self._query_matching, NearestNeighbours):
+            sampled = self._sampled(compared.query, references, check, compared)
+            return self._completed(compared.query, references, sampled, check, compared)
+        known = compared.matches
+        lacking = [it for it in references if it.key not in known]
+        made = self.match_quickly(compared.query, lacking, check) if lacking else ()
+        known |= {it.key: matches for it, matches in zip(lacking, made, strict=True)}
+        return [known[it.key] for it in references]
+
+    def _sampled(
+        self,
+        query: View,
+        references: Sequence[PosedView],
+        check: Callable[[], None],
+        compared: Compared | None,
+    ) -> Sequence[RowMaxima]:
+        """The comparisons of a sample of a query's keypoints with references."""
+        ours = query.features.every(self.options.sampled_share)
+        return self._compare(ours, references, check, None if compared is None else compared.sampled)
+
+    def _completed(
+        self,
+        query: View,
+        references: Sequence[PosedView],
+        sampled: Sequence[RowMaxima],
+        check: Callable[[], None],
+        compared: Compared | None,
+    ) -> Sequence[Matches]:
+        """The matches of all of a query's keypoints with references with which a sample of them was compared."""
+        assert isinstance(self._query_matching, NearestNeighbours)
+        step, ratio = self.options.sampled_share, self._query_matching.ratio
+        ours = query.features.but_every(step)
+        rest = self._compare(ours, references, check, None if compared is None else compared.rest)
+        return [it.with_every(step, some).matches(ratio) for it, some in zip(rest, sampled, strict=True)]
+
+    def _compare(
+        self,
+        ours: Features,
+        references: Sequence[PosedView],
+        check: Callable[[], None],
+        known: dict[str, RowMaxima] | None,
+    ) -> Sequence[RowMaxima]:
+        assert isinstance(self._query_matching, NearestNeighbours)
+        if known is None:
+            return self._query_matching.compare(ours, references, check)
+        lacking = [it for it in references if it.key not in known]
+        made = self._query_matching.compare(ours, lacking, check) if lacking else ()
+        known |= {it.key: found for it, found in zip(lacking, made, strict=True)}
+        return [known[it.key] for it in references]
 
     def to_rematch(self, matches: Sequence[Matches]) -> list[int]:
         """Returns the indices of the references that `rematch` should match with a query, the best first."""
