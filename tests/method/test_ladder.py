@@ -55,6 +55,8 @@ def climbed(doubts: Doubt, situation: Situation) -> list[str]:
         (Doubt.STARVED, Situation(is_best=False), []),
         (Doubt.TWO_PLACES, Situation(has_place=True), ["one place"]),
         (Doubt.LIKE_ELSEWHERE, Situation(may_be_elsewhere=True), ["elsewhere"]),
+        (Doubt.OTHER_SCENE, Situation(other_scene=1), ["other scene"]),
+        (Doubt.CAMERA | Doubt.STARVED, replace(ALL, other_scene=1), ["other scene"]),
         (
             Doubt.STARVED,
             Situation(can_match_strongly=(False, False, True), any_roll=1),

@@ -162,7 +162,7 @@ def doubting(search: Search, found: Found) -> Found:
     assert search.group is not None
     rank = search.group.next_scene((*search.tried, search.attempt))
     is_accepted = isinstance(found, Hypothesis) and found.is_accepted
-    if not is_accepted or rank is None or search.group.ranking[rank].agreement < LEAST_AGREEMENT:
+    if not is_accepted or rank is None or search.group.ranking[rank].agreement < PROMISE.agreement:
         return found
     return replace(found, doubts=found.doubts | Doubt.OTHER_SCENE)
 
