@@ -126,6 +126,7 @@ class RigLocalization:
         arbitrary_unit: as of `LocalizationResult`.
         capture_time: as it was sent.
         trust: as of `LocalizationResult`, from the evidence of all photographs together.
+        scene: as of `LocalizationResult`.
     """
 
     world_from_rig: RigidTransform
@@ -140,6 +141,7 @@ class RigLocalization:
     capture_time: datetime | None = None
     arbitrary_unit: bool = False
     trust: float | None = None
+    scene: str = ""
 
     def __str__(self) -> str:
         pose = pose_lines(self.world_from_rig, self.accuracy, self.arbitrary_unit)
@@ -165,6 +167,7 @@ class SequenceLocalization:
         jumps: where the photographs contradict the tracking, in order. `world_from_session`, covariance, accuracy and
             trust are of the photographs since the last one.
         trust: as of `LocalizationResult`, from the evidence of the photographs since the last jump together.
+        scene: as of `LocalizationResult`.
     """
 
     world_from_session: Similarity
@@ -180,6 +183,7 @@ class SequenceLocalization:
     arbitrary_unit: bool = False
     jumps: tuple[TrackingJump, ...] = ()
     trust: float | None = None
+    scene: str = ""
 
     def __str__(self) -> str:
         axes = Axes.__members__.get(self.axes, Axes.OPENCV)
@@ -204,6 +208,7 @@ class GroupRejected:
         images: contribution of each photograph, in order.
         hint, hypotheses: as of `Rejected`.
         capture_time: as it was sent.
+        scene: as of `Rejected`.
     """
 
     reason: str
@@ -212,6 +217,7 @@ class GroupRejected:
     hint: Hint | None = None
     hypotheses: tuple[Hypothesis, ...] = ()
     capture_time: datetime | None = None
+    scene: str = ""
 
     def __str__(self) -> str:
         return rejection_text(self.reason, self.message, self.hint)

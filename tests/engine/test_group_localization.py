@@ -37,7 +37,7 @@ from mapless_server.scheduling import (
     compute_items,
 )
 from mapless_server.security import SceneKey
-from mapless_server.services.localization import localize_group, localize_photographs
+from mapless_server.services.photographs import localize_group, localize_photographs
 
 LIMIT_S = 30.0
 MAX_BYTES = 1000

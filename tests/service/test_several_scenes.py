@@ -1,13 +1,15 @@
 """Several scenes in one call through a real server: what is found, refused, watched, logged and captured."""
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import grpc
 import numpy as np
 import pytest
 from support.corner import CAMERA, PAPERS, photograph, pose, wallpaper
+from support.images import encode
 from support.servers import RunningServer, serving_really
 from support.waiting import wait_until
 
@@ -15,6 +17,7 @@ from mapless import (
     Client,
     Datum,
     GeoPositionPrior,
+    GroupRejected,
     InvalidArgument,
     LocalizationResult,
     MaplessError,
@@ -24,6 +27,10 @@ from mapless import (
     PositionPrior,
     Priors,
     Rejected,
+    RigImage,
+    RigLocalization,
+    SequenceFrame,
+    SequenceLocalization,
 )
 from mapless.geodesy import world_from_other_world
 from mapless.v1 import localization_service_pb2 as pb
@@ -33,6 +40,7 @@ from mapless_server.services.capture.folder import calls_of
 
 HALL, YARD = Datum(47.0, 8.0, 400.0), Datum(47.001, 8.0, 400.0)
 OTHERS = [tuple(wallpaper(seed) for seed in range(first, first + 3)) for first in (10, 20)]
+ELSEWHERE = tuple(wallpaper(seed) for seed in range(30, 33))
 POSES = [pose(angle, height) for angle in (-12, 0, 12) for height in (-1.8, -1.2)]
 TRUE = pose(2.0, -1.5)
 PHOTO = photograph(TRUE)
@@ -120,6 +128,61 @@ def test_two_scenes_that_fit_are_both_named(client: Client) -> None:
     assert isinstance(answer, Rejected)
     assert answer.reason == "AMBIGUOUS"
     assert sorted(it.scene for it in answer.hypotheses) == ["scenes/hall", "scenes/twin"]
+
+
+WALK = [pose(angle, -1.5) for angle in (-4.0, 2.0, 8.0)]
+BLANK = encode(".png", np.full((CAMERA.height_px, CAMERA.width_px, 3), 90, np.uint8))
+
+
+def rig_of(photos: Sequence[bytes]) -> list[RigImage]:
+    return [RigImage(photo, CAMERA, at) for photo, at in zip(photos, WALK, strict=False)]
+
+
+def frames_of(photos: Sequence[bytes]) -> list[SequenceFrame]:
+    return [SequenceFrame(photo, CAMERA, at) for photo, at in zip(photos, WALK, strict=False)]
+
+
+@pytest.mark.parametrize("where", [{"scenes": ["yard", "hall"]}, {"group": SITE_A}])
+def test_a_rig_is_answered_as_with_its_scene_named(client: Client, where: dict[str, Any]) -> None:
+    """Its first photograph shows nothing, so that the second one finds the scene."""
+    images = rig_of([BLANK, *(photograph(it) for it in WALK[1:])])
+    named, answer = client.localize_rig(images, "hall"), client.localize_rig(images, **where)
+    assert isinstance(named, RigLocalization)
+    assert isinstance(answer, RigLocalization), str(answer)
+    assert (answer.scene, named.scene) == ("scenes/hall", "scenes/hall")
+    np.testing.assert_array_equal(answer.world_from_rig.matrix(), named.world_from_rig.matrix())
+
+
+def test_a_sequence_is_answered_as_with_its_scene_named(client: Client) -> None:
+    frames = frames_of([photograph(it) for it in WALK])
+    at_hall = Priors(geo_position=GeoPositionPrior(47.0, 8.0, 5.0))
+    frames[0] = replace(frames[0], priors=at_hall)
+    named, answer = client.localize_sequence(frames, "hall"), client.localize_sequence(frames, group=SITE_A)
+    assert isinstance(named, SequenceLocalization)
+    assert isinstance(answer, SequenceLocalization), str(answer)
+    assert answer.scene == "scenes/hall"
+    np.testing.assert_array_equal(answer.world_from_session.rotation, named.world_from_session.rotation)
+    assert answer.images[0].prior_checks == named.images[0].prior_checks
+
+
+def test_a_rig_that_fits_two_scenes_is_ambiguous(client: Client) -> None:
+    answer = client.localize_rig(rig_of([photograph(it) for it in WALK]), group={})
+    assert isinstance(answer, GroupRejected)
+    assert answer.reason == "AMBIGUOUS"
+    assert sorted(it.scene for it in answer.hypotheses) == ["scenes/hall", "scenes/twin"]
+
+
+def test_a_rig_of_no_scene_is_rejected(client: Client) -> None:
+    answer = client.localize_rig(rig_of([photograph(it, papers=ELSEWHERE) for it in WALK[:2]]), group=SITE_A)
+    assert isinstance(answer, GroupRejected)
+    assert answer.reason != "AMBIGUOUS"
+
+
+def test_a_photograph_with_references_names_its_scene(client: Client) -> None:
+    images = [replace(it, references=("scenes/hall/references/r0",)) for it in rig_of([PHOTO])]
+    with pytest.raises(InvalidArgument) as refused:
+        client.localize_rig(images, group=SITE_A)
+    assert refused.value.field == "images[0].references"
 
 
 def test_watchers_see_answers_of_their_scene_and_nothing_of_others(client: Client, server: RunningServer) -> None:

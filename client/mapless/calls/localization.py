@@ -136,7 +136,11 @@ async def _localize_request(
 
 
 def _set_scenes(
-    request: pb.LocalizeRequest, scene: str, scenes: Sequence[str], group: Mapping[str, str] | None, prior_scene: str
+    request: pb.LocalizeRequest | pb.LocalizeRigRequest | pb.LocalizeSequenceRequest,
+    scene: str,
+    scenes: Sequence[str],
+    group: Mapping[str, str] | None,
+    prior_scene: str,
 ) -> None:
     """Sets where the photograph may have been taken; ValueError unless exactly one of scene, scenes and group is."""
     if isinstance(scenes, str):
@@ -221,8 +225,11 @@ def _streamed(message: pb.LocalizeProgressivelyResponse) -> LocalizationResult |
 async def localize_rig(
     connection: Connection,
     images: Sequence[RigImage],
-    scene: str,
+    scene: str = "",
     *,
+    scenes: Sequence[str] = (),
+    group: Mapping[str, str] | None = None,
+    prior_scene: str = "",
     reference_count: int = 0,
     coverage: float = 0.0,
     confidential: bool = False,
@@ -237,7 +244,10 @@ async def localize_rig(
 
     Args:
         images: the photographs, 1 to 8.
-        scene: the scene to localize in.
+        scene: the scene to localize in. Exactly one of this, `scenes` and `group` is required.
+        scenes, group: where the server finds the scene by the photographs, which must name no references; see
+            `localize`.
+        prior_scene: see `localize`; for the priors of all photographs.
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
         confidential: see `localize`.
@@ -248,7 +258,6 @@ async def localize_rig(
         timeout_s: deadline of the call.
     """
     request = pb.LocalizeRigRequest(
-        scene=scene_name(scene),
         images=[
             await connection.unblocked(_rig_image_to_message, image, scene, field)
             for field, image in wire.listed(images, RigImage, "images")
@@ -260,6 +269,7 @@ async def localize_rig(
             include_imprecise_pose=include_imprecise_pose,
         ),
     )
+    _set_scenes(request, scene, scenes, group, prior_scene)
     if capture_time is not None:
         wire.set_time(request.capture_time, capture_time, "capture_time")
     if session_from_rig is not None:
@@ -272,8 +282,11 @@ async def localize_rig(
 async def localize_sequence(
     connection: Connection,
     frames: Sequence[SequenceFrame],
-    scene: str,
+    scene: str = "",
     *,
+    scenes: Sequence[str] = (),
+    group: Mapping[str, str] | None = None,
+    prior_scene: str = "",
     estimate_session_scale: bool = False,
     reference_count: int = 0,
     coverage: float = 0.0,
@@ -289,7 +302,10 @@ async def localize_sequence(
 
     Args:
         frames: 2 to 16 photographs with the device's poses, the oldest first.
-        scene: the scene to localize in.
+        scene: the scene to localize in. Exactly one of this, `scenes` and `group` is required.
+        scenes, group: where the server finds the scene by the photographs, which must name no references; see
+            `localize`.
+        prior_scene: see `localize`; for the priors of all photographs.
         estimate_session_scale: whether the scale of the device's poses is unknown; the device must have moved.
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
@@ -300,7 +316,6 @@ async def localize_sequence(
         timeout_s: deadline of the call.
     """
     request = pb.LocalizeSequenceRequest(
-        scene=scene_name(scene),
         frames=[
             await connection.unblocked(_frame_to_message, frame, scene, field)
             for field, frame in wire.listed(frames, SequenceFrame, "frames")
@@ -313,6 +328,7 @@ async def localize_sequence(
             axes=wire.enum_value(pb.Axes, axes),
         ),
     )
+    _set_scenes(request, scene, scenes, group, prior_scene)
     wire.set_numbers(request, {"estimate_session_scale": estimate_session_scale})
     answer = await connection.call("LocalizeSequence", request, sequence_from_message, timeout_s)
     _check_depths(request.frames, answer.images)
@@ -354,7 +370,8 @@ def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: s
     if given.intrinsics_uncertainty is not None:
         uncertainty = _uncertainty_to_message(given.intrinsics_uncertainty, f"{field}.intrinsics_uncertainty")
         message.intrinsics_uncertainty.CopyFrom(uncertainty)
-    message.references.extend(reference_names(scene, given.references))
+    if given.references:
+        message.references.extend(reference_names(scene, given.references))
     set_priors(message, given.priors, f"{field}.priors")
     return message
 

@@ -778,18 +778,24 @@ class Debug(_message.Message):
     def __init__(self, query_x_px: _Optional[_Iterable[float]] = ..., query_y_px: _Optional[_Iterable[float]] = ..., point_x_m: _Optional[_Iterable[float]] = ..., point_y_m: _Optional[_Iterable[float]] = ..., point_z_m: _Optional[_Iterable[float]] = ..., is_inlier: _Optional[_Iterable[bool]] = ..., error_px: _Optional[_Iterable[float]] = ..., reference: _Optional[_Iterable[int]] = ..., reference_x_px: _Optional[_Iterable[float]] = ..., reference_y_px: _Optional[_Iterable[float]] = ..., source: _Optional[_Iterable[_Union[PointSource, str]]] = ...) -> None: ...
 
 class LocalizeRigRequest(_message.Message):
-    __slots__ = ("scene", "images", "options", "capture_time", "session_from_rig")
+    __slots__ = ("scene", "images", "options", "capture_time", "session_from_rig", "scenes", "scene_group", "prior_scene")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     IMAGES_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_RIG_FIELD_NUMBER: _ClassVar[int]
+    SCENES_FIELD_NUMBER: _ClassVar[int]
+    SCENE_GROUP_FIELD_NUMBER: _ClassVar[int]
+    PRIOR_SCENE_FIELD_NUMBER: _ClassVar[int]
     scene: str
     images: _containers.RepeatedCompositeFieldContainer[RigImage]
     options: LocalizeOptions
     capture_time: _timestamp_pb2.Timestamp
     session_from_rig: _geometry_pb2.RigidTransform
-    def __init__(self, scene: _Optional[str] = ..., images: _Optional[_Iterable[_Union[RigImage, _Mapping]]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+    scenes: _containers.RepeatedScalarFieldContainer[str]
+    scene_group: SceneGroup
+    prior_scene: str
+    def __init__(self, scene: _Optional[str] = ..., images: _Optional[_Iterable[_Union[RigImage, _Mapping]]] = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., scenes: _Optional[_Iterable[str]] = ..., scene_group: _Optional[_Union[SceneGroup, _Mapping]] = ..., prior_scene: _Optional[str] = ...) -> None: ...
 
 class RigImage(_message.Message):
     __slots__ = ("image", "intrinsics", "rig_from_camera", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask", "depth", "intrinsics_uncertainty")
@@ -820,18 +826,20 @@ class RigImage(_message.Message):
     def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., rig_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ...) -> None: ...
 
 class LocalizeRigResponse(_message.Message):
-    __slots__ = ("localization", "rejection", "images", "capture_time", "session_from_rig")
+    __slots__ = ("localization", "rejection", "images", "capture_time", "session_from_rig", "scene")
     LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
     REJECTION_FIELD_NUMBER: _ClassVar[int]
     IMAGES_FIELD_NUMBER: _ClassVar[int]
     CAPTURE_TIME_FIELD_NUMBER: _ClassVar[int]
     SESSION_FROM_RIG_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
     localization: RigLocalization
     rejection: Rejection
     images: _containers.RepeatedCompositeFieldContainer[ImageReport]
     capture_time: _timestamp_pb2.Timestamp
     session_from_rig: _geometry_pb2.RigidTransform
-    def __init__(self, localization: _Optional[_Union[RigLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ...) -> None: ...
+    scene: str
+    def __init__(self, localization: _Optional[_Union[RigLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., session_from_rig: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., scene: _Optional[str] = ...) -> None: ...
 
 class RigLocalization(_message.Message):
     __slots__ = ("world_from_rig", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "world_from_session", "geo_pose", "arbitrary_unit", "trust")
@@ -874,16 +882,22 @@ class ImageReport(_message.Message):
     def __init__(self, inlier_count: _Optional[int] = ..., match_count: _Optional[int] = ..., alone: _Optional[_Union[Rejection, _Mapping]] = ..., diagnostics: _Optional[_Union[Diagnostics, _Mapping]] = ..., prior_checks: _Optional[_Iterable[_Union[PriorCheck, _Mapping]]] = ..., used_intrinsics: _Optional[_Union[UsedIntrinsics, _Mapping]] = ...) -> None: ...
 
 class LocalizeSequenceRequest(_message.Message):
-    __slots__ = ("scene", "frames", "estimate_session_scale", "options")
+    __slots__ = ("scene", "frames", "estimate_session_scale", "options", "scenes", "scene_group", "prior_scene")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     FRAMES_FIELD_NUMBER: _ClassVar[int]
     ESTIMATE_SESSION_SCALE_FIELD_NUMBER: _ClassVar[int]
     OPTIONS_FIELD_NUMBER: _ClassVar[int]
+    SCENES_FIELD_NUMBER: _ClassVar[int]
+    SCENE_GROUP_FIELD_NUMBER: _ClassVar[int]
+    PRIOR_SCENE_FIELD_NUMBER: _ClassVar[int]
     scene: str
     frames: _containers.RepeatedCompositeFieldContainer[SequenceFrame]
     estimate_session_scale: bool
     options: LocalizeOptions
-    def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., estimate_session_scale: bool = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ...) -> None: ...
+    scenes: _containers.RepeatedScalarFieldContainer[str]
+    scene_group: SceneGroup
+    prior_scene: str
+    def __init__(self, scene: _Optional[str] = ..., frames: _Optional[_Iterable[_Union[SequenceFrame, _Mapping]]] = ..., estimate_session_scale: bool = ..., options: _Optional[_Union[LocalizeOptions, _Mapping]] = ..., scenes: _Optional[_Iterable[str]] = ..., scene_group: _Optional[_Union[SceneGroup, _Mapping]] = ..., prior_scene: _Optional[str] = ...) -> None: ...
 
 class SequenceFrame(_message.Message):
     __slots__ = ("image", "intrinsics", "session_from_camera", "capture_time", "references", "position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior", "mask", "depth", "intrinsics_uncertainty")
@@ -916,14 +930,16 @@ class SequenceFrame(_message.Message):
     def __init__(self, image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., session_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., capture_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., references: _Optional[_Iterable[str]] = ..., position_prior: _Optional[_Union[PositionPrior, _Mapping]] = ..., heading_prior: _Optional[_Union[HeadingPrior, _Mapping]] = ..., geo_position_prior: _Optional[_Union[GeoPositionPrior, _Mapping]] = ..., gravity_prior: _Optional[_Union[GravityPrior, _Mapping]] = ..., pose_prior: _Optional[_Union[PosePrior, _Mapping]] = ..., mask: _Optional[bytes] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., intrinsics_uncertainty: _Optional[_Union[IntrinsicsUncertainty, _Mapping]] = ...) -> None: ...
 
 class LocalizeSequenceResponse(_message.Message):
-    __slots__ = ("localization", "rejection", "images")
+    __slots__ = ("localization", "rejection", "images", "scene")
     LOCALIZATION_FIELD_NUMBER: _ClassVar[int]
     REJECTION_FIELD_NUMBER: _ClassVar[int]
     IMAGES_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
     localization: SequenceLocalization
     rejection: Rejection
     images: _containers.RepeatedCompositeFieldContainer[ImageReport]
-    def __init__(self, localization: _Optional[_Union[SequenceLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ...) -> None: ...
+    scene: str
+    def __init__(self, localization: _Optional[_Union[SequenceLocalization, _Mapping]] = ..., rejection: _Optional[_Union[Rejection, _Mapping]] = ..., images: _Optional[_Iterable[_Union[ImageReport, _Mapping]]] = ..., scene: _Optional[str] = ...) -> None: ...
 
 class SequenceLocalization(_message.Message):
     __slots__ = ("world_from_session", "session_scale", "session_scale_sigma", "poses", "covariance", "accuracy", "inlier_count", "match_count", "reprojection_error_px", "axes", "arbitrary_unit", "jumps", "trust")

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from mapless_server.errors import Overloaded, RequestError
@@ -51,6 +52,16 @@ class GroupResult:
     queued_s: tuple[float, ...]
     seconds: tuple[float, ...]
     processor_s: tuple[float, ...]
+
+    @staticmethod
+    def of(groups: Sequence[GroupResult]) -> GroupResult:
+        """The results of several groups, one after the other."""
+        return GroupResult(
+            tuple(chain.from_iterable(it.results for it in groups)),
+            tuple(chain.from_iterable(it.queued_s for it in groups)),
+            tuple(chain.from_iterable(it.seconds for it in groups)),
+            tuple(chain.from_iterable(it.processor_s for it in groups)),
+        )
 
     def and_then(self, indices: Sequence[int], later: GroupResult) -> GroupResult:
         """The results after some photographs, by their indices, were localized again: theirs are the later ones."""

@@ -3,14 +3,13 @@
 from collections.abc import Mapping
 
 from mapless import names
-from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.cache import LruCache
 from mapless_server.errors import NotFound
 from mapless_server.security import Principal, scene_id_of
 from mapless_server.store import Store
 
 from .messages.references import labels_from_message
-from .messages.scenes import FoundScenes, scene_keys_from_message
+from .messages.scenes import AnyRequest, FoundScenes, scene_keys_from_message
 from .reach import Reach
 
 CACHED_SCENES = 100_000
@@ -25,7 +24,7 @@ class SceneFinder:
         self._reach = reach
         self._groups: LruCache[tuple[object, FoundScenes]] = LruCache(CACHED_SCENES, keeps_latest=True)
 
-    def find(self, request: pb.LocalizeRequest, principal: Principal) -> FoundScenes:
+    def find(self, request: AnyRequest, principal: Principal) -> FoundScenes:
         """The scenes that a request lists, or those of its group that are within the caller's reach.
 
         FieldError names a wrong field; NotFound has the field scenes[i] of a scene that does not exist, or scene_group
@@ -42,7 +41,7 @@ class SceneFinder:
             raise NotFound(f"there is no scene{shown}", field="scene_group")
         return found
 
-    def _named(self, request: pb.LocalizeRequest, principal: Principal) -> FoundScenes:
+    def _named(self, request: AnyRequest, principal: Principal) -> FoundScenes:
         listed = scene_keys_from_message(request, principal.tenant)
         keys = self._reach.keys(principal, [scene_id_of(it) for it in listed])
         found = self._store.find_scenes_named(keys)

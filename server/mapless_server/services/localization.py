@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, Awaitable, Callable, Coroutine, Sequence
-from dataclasses import replace
+from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
@@ -17,11 +16,8 @@ from mapless_server.engine.groups import (
     MAX_RIG_IMAGES,
     MIN_FRAMES,
     GroupResult,
-    PhotoGroup,
-    after_rejection,
 )
 from mapless_server.engine.query import TRACK, Query, Result, SceneQuestion
-from mapless_server.errors import RequestError
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.structure.model import MetricScale
@@ -37,6 +33,7 @@ from .messages.answers import AnswerFrames, answer_frames_of, diagnostics_to_mes
 from .messages.debug import debug_to_message
 from .messages.groups import (
     poses_from_message,
+    queries_among,
     queries_from_message,
     rig_to_message,
     sequence_to_message,
@@ -47,13 +44,12 @@ from .messages.groups import (
 from .messages.priors import needs_attributes
 from .messages.queries import query_among, query_from_message
 from .messages.scenes import names_several, questions_from_message
+from .photographs import Joint, localize_group
 from .reach import Reach
 from .watching import Watcher, Watchers
 
 if TYPE_CHECKING:  # services do not load what computes
     from mapless_server.engine.queue_engine import QueueEngine
-
-Joint = TypeVar("Joint")
 
 GiveBetter = Callable[[pb.LocalizeResponse], None]
 """Receives an answer that is better than those before, while the final one is computed."""
@@ -231,6 +227,12 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         call: Call,
     ) -> tuple[Query, ...]:
         """Converts the photographs of a request to queries; FieldError or RequestError names the wrong field."""
+        if names_several(request):
+            find = partial(self._scenes.find, request, call.principal)
+            found, extents = await asyncio.to_thread(find), self._engine().references.extents_m
+            questions = partial(questions_from_message, found=found, tenant=call.principal.tenant, extents=extents)
+            call.note(scenes=len(found.scenes))
+            return queries_among(request, list_name, bounds, self._engine().options, questions)
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
         tenant, attributes = tenant_of(scene_key), await self._attributes(getattr(request, list_name), scene_key)
         return queries_from_message(request, list_name, bounds, tenant, self._engine().options, attributes)
@@ -309,82 +311,6 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     def _capture(self, request: Request, response: Response, call: Call, parts: Sequence[tuple[Query, Result]]) -> None:
         if self._recorder is not None and not request.options.confidential:
             self._recorder.record(request, response, call, parts, self._engine().tiers)
-
-
-async def localize_group(
-    engine: QueueEngine,
-    queries: Sequence[Query],
-    call: Call,
-    list_name: str,
-    pose: Callable[[Sequence[Query], Sequence[Result]], Awaitable[Joint | Rejection]],
-) -> tuple[GroupResult, Joint | Rejection]:
-    """Localizes the photographs of a rig or a sequence, and computes their joint `pose`.
-
-    After a rejection the ladder says whether all of them are localized again; if that fails, the rejection stays.
-    """
-    asked, group = await localize_with_cameras(engine, queries, call, list_name)
-    outcome = await _posed(asked, group, pose)
-    elsewhere = after_rejection(asked, outcome) if isinstance(outcome, Rejection) else None
-    if elsewhere is None:
-        return group, outcome
-    try:
-        asked, again = await localize_with_cameras(engine, elsewhere, call, list_name)
-        again = again.read_as_in(group)
-        found = await _posed(asked, again, pose)
-    except RequestError:  # a failed attempt at a better answer must not cost the first one
-        return group, outcome
-    return (group, outcome) if isinstance(found, Rejection) else (again, found)
-
-
-async def _posed(
-    queries: Sequence[Query],
-    group: GroupResult,
-    pose: Callable[[Sequence[Query], Sequence[Result]], Awaitable[Joint | Rejection]],
-) -> Joint | Rejection:
-    """The joint pose; the rejection of a photograph if the camera of none of them is known."""
-    if all(it.photo.exif is not None for it in queries):
-        unknown = group.results[0].answer.outcome
-        assert isinstance(unknown, Rejection)
-        return unknown
-    return await pose(queries, group.results)
-
-
-async def localize_with_cameras(
-    engine: QueueEngine, queries: Sequence[Query], call: Call, list_name: str
-) -> tuple[Sequence[Query], GroupResult]:
-    """Localizes each photograph; those without intrinsics again, with the camera that all those of one camera have.
-
-    Returns the queries with these cameras; photographs whose camera is not known are rejected, without matches.
-    """
-    group = await localize_photographs(engine, queries, call, list_name)
-    if all(it.photo.exif is None for it in queries):
-        return queries, group
-    from mapless_server.engine import group_cameras  # services do not load what computes
-
-    cameras = group_cameras.common_cameras(queries, group.results, is_sequence=list_name == "frames")
-    asked = [group_cameras.read_with(query, cameras.get(i)) for i, query in enumerate(queries)]
-    again = group_cameras.read_otherwise(group.results, cameras)
-    if again:
-        later = await localize_photographs(engine, [asked[i] for i in again], call, list_name)
-        group = group.and_then(again, later)
-    results = [group_cameras.answered(it, i, cameras) for i, it in enumerate(group.results)]
-    return asked, replace(group, results=tuple(results))
-
-
-async def localize_photographs(
-    engine: QueueEngine, queries: Sequence[Query], call: Call, list_name: str
-) -> GroupResult:
-    """Localizes each photograph of a rig or a sequence, and records their stages even if one of them fails.
-
-    The photographs, of one scene, are in the request's field `list_name`. RequestError as in `PhotoGroup.localize`.
-    """
-    call.note(scene=queries[0].scene_key, images=len(queries))
-    group = PhotoGroup(engine, queries, call.caller, list_name)
-    try:
-        return await group.localize()
-    finally:
-        for records in group.records:
-            call.record(records)
 
 
 async def better_then_final(

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -15,11 +15,12 @@ from mapless.axes import WORLD_FROM_RIGHT_HANDED, Axes, pose_from
 from mapless.geometry import Array, RigidTransform, Similarity
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError
-from mapless_server.engine.query import Query
+from mapless_server.engine.query import Query, SceneQuestion
 from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.options import ChosenCamera, IntrinsicsSource, LocalizeOptions, Variant
 from mapless_server.method.rejection import Rejection
-from mapless_server.security import key_of
+from mapless_server.scenes import ANYWHERE
+from mapless_server.security import SceneKey, key_of
 from mapless_server.store import SceneAttributes
 
 from .answers import (
@@ -32,6 +33,7 @@ from .answers import (
     geo_pose_to_message,
     rejection_to_message,
     result_to_rejection,
+    scene_to_name,
     set_used_intrinsics,
 )
 from .enums import enum_to_message, message_of
@@ -40,6 +42,7 @@ from .queries import (
     MAX_CANDIDATES,
     MAX_REFERENCES,
     check_capture_time,
+    check_prior_scene,
     options_from_message,
     photo_from_message,
     reference_count_from_message,
@@ -56,9 +59,17 @@ if TYPE_CHECKING:
     from mapless_server.method.groups.rig import RigEstimate
     from mapless_server.method.groups.sequence import SequenceEstimate
 
+GroupRequest = pb.LocalizeRigRequest | pb.LocalizeSequenceRequest
+Photograph = pb.RigImage | pb.SequenceFrame
+
+Asked = TypeVar("Asked")
+
+PRIORS = ("position_prior", "heading_prior", "geo_position_prior", "gravity_prior", "pose_prior")
+"""Fields of a photograph, the same of all requests."""
+
 
 def queries_from_message(
-    request: pb.LocalizeRigRequest | pb.LocalizeSequenceRequest,
+    request: GroupRequest,
     list_name: str,
     bounds: tuple[int, int],
     tenant: str,
@@ -71,38 +82,87 @@ def queries_from_message(
     is true for a photograph. FieldError and InvalidArgument name the wrong field, "images[2].intrinsics".
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
+    check_prior_scene(request)
+    most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
+
+    def in_scene(message: Photograph) -> tuple[SceneQuestion, tuple[str, ...]]:
+        reference_ids = reference_ids_from_names(message.references, scene_id, most)
+        narrowing, priors = priors_from_message(message, attributes)
+        known = attributes if needs_attributes(message) else None
+        return SceneQuestion(key_of(tenant, scene_id), narrowing, priors, known), reference_ids
+
+    asked = _asked(request, list_name, bounds, in_scene)
+    return _queries(request, list_name, engine, asked)
+
+
+def queries_among(
+    request: GroupRequest,
+    list_name: str,
+    bounds: tuple[int, int],
+    engine: EngineOptions,
+    questions: Callable[[pb.LocalizeRequest], tuple[Sequence[SceneQuestion], SceneKey | None]],
+) -> tuple[Query, ...]:
+    """Converts the photographs of a request with several scenes to queries among them.
+
+    `questions` finds what the priors of a photograph say in each scene. FieldError and InvalidArgument as for one.
+    """
+
+    def among(message: Any) -> Sequence[SceneQuestion]:
+        alone = pb.LocalizeRequest(prior_scene=request.prior_scene, references=message.references)
+        for name in PRIORS:
+            if message.HasField(name):
+                getattr(alone, name).CopyFrom(getattr(message, name))
+        return questions(alone)[0]
+
+    found = _asked(request, list_name, bounds, among)
+    first = [(SceneQuestion(it[0].scene_key, ANYWHERE), ()) for it in found]
+    queries = _queries(request, list_name, engine, first)
+    return tuple(replace(query, scenes=scenes) for query, scenes in zip(queries, found, strict=True))
+
+
+def _asked(
+    request: GroupRequest, list_name: str, bounds: tuple[int, int], asked: Callable[[Photograph], Asked]
+) -> list[Asked]:
+    """What is asked of each photograph; FieldError with its path in the request."""
     if isinstance(request, pb.LocalizeRigRequest):
         check_capture_time(request)
     messages = getattr(request, list_name)
     least, most = bounds
     if not least <= len(messages) <= most:
         raise FieldError(list_name, f"must be {least} to {most}, are {len(messages)}")
-    options = _options_of(request, engine.coverage)
-    reranks = request.options.rerank_references
-    count = reference_count_from_message(request.options)
-    most_references = MAX_CANDIDATES if reranks else MAX_REFERENCES
-    queries = []
+    found = []
     for i, message in enumerate(messages):
-        path = f"{list_name}[{i}]"
-        with _within(path):
+        with _within(f"{list_name}[{i}]"):
             if isinstance(message, pb.SequenceFrame):
                 check_capture_time(message)
-            reference_ids = reference_ids_from_names(message.references, scene_id, most_references)
-            narrowing, priors = priors_from_message(message, attributes)
+            found.append(asked(message))
+    return found
+
+
+def _queries(
+    request: GroupRequest,
+    list_name: str,
+    engine: EngineOptions,
+    asked: Sequence[tuple[SceneQuestion, tuple[str, ...]]],
+) -> tuple[Query, ...]:
+    options = _options_of(request, engine.coverage)
+    count, queries = reference_count_from_message(request.options), []
+    for i, (message, (question, reference_ids)) in enumerate(zip(getattr(request, list_name), asked, strict=True)):
+        path = f"{list_name}[{i}]"
         photo = photo_from_message(message, path, engine.image_limits, needs_intrinsics=False)
         queries.append(
             Query(
-                scene_key=key_of(tenant, scene_id),
+                scene_key=question.scene_key,
                 reference_ids=reference_ids,
                 photo=with_depth(photo, message, path, engine.image_limits),
-                narrowing=narrowing,
+                narrowing=question.narrowing,
                 reference_count=count,
                 options=uncertain_options(options, message, photo, path),
-                rerank=reranks and bool(message.references),
-                priors=priors,
+                rerank=request.options.rerank_references and bool(reference_ids),
+                priors=question.priors,
                 is_part=True,
                 is_generic=request.options.ignore_calibration,
-                attributes=attributes if needs_attributes(message) else None,
+                attributes=question.attributes,
             )
         )
     if isinstance(request, pb.LocalizeSequenceRequest):
@@ -201,7 +261,7 @@ def rig_to_message(
 ) -> pb.LocalizeRigResponse:
     """Makes the response, without the call's id."""
     if isinstance(outcome, Rejection):
-        response = pb.LocalizeRigResponse(rejection=rejection_to_message(outcome))
+        response = pb.LocalizeRigResponse(rejection=rejection_to_message(outcome, group.results[-1].scene_key))
     else:
         world_from_rig = wire.transform_to_message(outcome.world_from_rig)
         message = pb.RigLocalization(world_from_rig=world_from_rig, trust=outcome.trust)
@@ -214,6 +274,7 @@ def rig_to_message(
         if attributes.datum is not None:
             message.geo_pose.CopyFrom(geo_pose_to_message(outcome.world_from_rig, attributes.datum))
         response = pb.LocalizeRigResponse(localization=message)
+    response.scene = scene_of_group(group)
     frames = AnswerFrames(Axes.OPENCV, None, request.options.include_imprecise_pose)
     response.images.extend(_reports(outcome, group, queries, [frames] * len(queries)))
     for echoed in ("capture_time", "session_from_rig"):
@@ -231,7 +292,7 @@ def sequence_to_message(
 ) -> pb.LocalizeSequenceResponse:
     """Makes the response, without the call's id."""
     if isinstance(outcome, Rejection):
-        response = pb.LocalizeSequenceResponse(rejection=rejection_to_message(outcome))
+        response = pb.LocalizeSequenceResponse(rejection=rejection_to_message(outcome, group.results[-1].scene_key))
     else:
         session = outcome.world_from_session
         message = pb.SequenceLocalization(
@@ -249,11 +310,17 @@ def sequence_to_message(
                 captured.capture_time.CopyFrom(frame.capture_time)
         _set_support(message, outcome.matched, outcome.covariances[-1])
         response = pb.LocalizeSequenceResponse(localization=message)
+    response.scene = scene_of_group(group)
     includes = request.options.include_imprecise_pose
     sessions = poses_from_message(request.frames, "frames", "session_from_camera")
     frames = [AnswerFrames(axes, session, includes) for session in sessions]
     response.images.extend(_reports(outcome, group, queries, frames))
     return response
+
+
+def scene_of_group(group: GroupResult) -> str:
+    """Name of the scene of a group's photographs; of an ambiguous one the one that its last photograph matches best."""
+    return scene_to_name(group.results[-1].scene_key)
 
 
 def _in_axes(world_from_session: Similarity, axes: Axes) -> RigidTransform:

@@ -126,8 +126,7 @@ def query_from_message(
     `attributes` are the scene's; they may be empty unless `needs_attributes` is true.
     """
     scene_id = wire.scene_id_from_name(request.scene, "scene")
-    if request.prior_scene not in ("", request.scene):
-        raise FieldError("prior_scene", f"must be empty or {names.shown(request.scene)}, the request's scene")
+    check_prior_scene(request)
     narrowing, priors = priors_from_message(request, attributes)
     known = attributes if needs_attributes(request) else None
     most = MAX_CANDIDATES if request.options.rerank_references else MAX_REFERENCES
@@ -171,6 +170,12 @@ def _query_in(
         is_generic=request.options.ignore_calibration,
         attributes=question.attributes,
     )
+
+
+def check_prior_scene(request: pb.LocalizeRequest | pb.LocalizeRigRequest | pb.LocalizeSequenceRequest) -> None:
+    """Raises FieldError if the priors of a request that names its scene are given in another scene's world."""
+    if request.prior_scene not in ("", request.scene):
+        raise FieldError("prior_scene", f"must be empty or {names.shown(request.scene)}, the request's scene")
 
 
 def check_capture_time(message: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from .priors import SETS_DATUM, check_positions, narrowing_at_place, needs_attri
 from .queries import scene_key_from_name
 
 MAX_SCENES = 64
+
+AnyRequest = pb.LocalizeRequest | pb.LocalizeRigRequest | pb.LocalizeSequenceRequest
+"""A request that names one scene, several, or their group."""
 
 UNKNOWN = SceneAttributes()
 
@@ -64,9 +68,10 @@ def _attributes_of(scene: GroupedScene) -> SceneAttributes:
         return UNKNOWN
 
 
-def names_several(request: pb.LocalizeRequest) -> bool:
+def names_several(request: AnyRequest) -> bool:
     """Whether a request gives several scenes instead of one; FieldError if it gives both, or none."""
-    is_given = {"scene": request.scene, "scenes": request.scenes, "scene_group": request.HasField("scene_group")}
+    message: Any = request
+    is_given = {"scene": request.scene, "scenes": request.scenes, "scene_group": message.HasField("scene_group")}
     given = [name for name, is_there in is_given.items() if is_there]
     if len(given) > 1:
         message = f"must not be given together with {given[0]}: exactly one of {', '.join(is_given)} is required"
@@ -76,7 +81,7 @@ def names_several(request: pb.LocalizeRequest) -> bool:
     return given != ["scene"]
 
 
-def scene_keys_from_message(request: pb.LocalizeRequest, tenant: str) -> list[SceneKey]:
+def scene_keys_from_message(request: AnyRequest, tenant: str) -> list[SceneKey]:
     """Keys of the scenes that a request lists; FieldError if there are too many, or a name is wrong or repeated."""
     if len(request.scenes) > MAX_SCENES:
         raise FieldError("scenes", f"must be at most {MAX_SCENES}, are {len(request.scenes)}; scene_group has no limit")
