@@ -1,5 +1,6 @@
 // Localizes a photograph: localize ADDRESS SCENE PHOTO WIDTH HEIGHT FX FY CX CY [DEPTH [UNIT_M]], with the PNG of 16 bits of a depth
-// camera that is aligned with it, millimetres unless UNIT_M says another. MAPLESS_TOKEN has the token, MAPLESS_CA the file of the
+// camera that is aligned with it, millimetres unless UNIT_M says another. In place of SCENE a label, site=a, finds the scene among those
+// that have it; the position is in the world of the scene that is printed. MAPLESS_TOKEN has the token, MAPLESS_CA the file of the
 // authority that signed the server's certificate; with it the connection is encrypted.
 //
 // Exit codes as those of the command `mapless`: 0 localized, 1 the call failed, 2 wrong usage, 3 not localized.
@@ -14,6 +15,7 @@ void Print(const mapless::v1::LocalizeResponse& answer) {
   const auto& found = answer.localization();
   const auto& position = found.world_from_camera().translation_m();
   const auto& q = found.world_from_camera().rotation();
+  if (answer.diagnostics().searched_scene_count() > 1) std::printf("in %s\n", answer.scene().c_str());
   std::printf("position  %.3f %.3f %.3f m", position.x(), position.y(), position.z());
   if (found.has_accuracy()) std::printf("   within %.1f cm (95 %%)", 100 * found.accuracy().position_95_m());
   std::printf("\nrotation  x %.4f y %.4f z %.4f w %.4f\n", q.x(), q.y(), q.z(), q.w());
@@ -31,7 +33,13 @@ int Run(int count, char** arguments) {
   const mapless::Client client(options);
 
   mapless::v1::LocalizeRequest request;
-  request.set_scene(std::string("scenes/") + arguments[2]);
+  const std::string where = arguments[2];
+  const auto equals = where.find('=');
+  if (equals == std::string::npos) {
+    request.set_scene("scenes/" + where);
+  } else {
+    (*request.mutable_scene_group()->mutable_labels())[where.substr(0, equals)] = where.substr(equals + 1);
+  }
   request.set_image(mapless::ReadFile(arguments[3]));
   double numbers[6];
   for (int i = 0; i < 6; ++i) numbers[i] = std::stod(arguments[4 + i]);

@@ -12,6 +12,7 @@
 
 #include "mapless/client/wire.pb.h"
 #include "repeats.h"
+#include "routing.h"
 #include "servers.h"
 
 namespace mapless {
@@ -22,25 +23,6 @@ constexpr char kHealth[] = "/grpc.health.v1.Health/Check";
 constexpr int kServing = 1;
 // Of a health check, which asks how the server is now.
 constexpr int kCheckAttempts = 4;
-
-bool IsVisible(const std::string& text) {
-  return !text.empty() && std::all_of(text.begin(), text.end(), [](char c) { return c > ' ' && c < '\x7f'; });
-}
-
-// The scene of a request, "scenes/{scene}", for load balancers in front of several servers; empty where there is none.
-std::string SceneOf(const google::protobuf::Message& request) {
-  const auto* reflection = request.GetReflection();
-  for (const char* name : {"scene", "name", "scene_id"}) {
-    const auto* field = request.GetDescriptor()->FindFieldByName(name);
-    if (field == nullptr) continue;
-    if (field->cpp_type() == google::protobuf::FieldDescriptor::CPPTYPE_MESSAGE)  // the scene itself
-      return SceneOf(reflection->GetMessage(request, field));
-    std::string value = reflection->GetString(request, field);
-    if (std::string(name) == "scene_id") return value.empty() ? "" : "scenes/" + value;
-    return value.substr(0, value.find("/references/"));
-  }
-  return "";
-}
 
 [[noreturn]] void Throw(const grpc::Status& given, const grpc::ClientContext& context) {
   const grpc::Status status = StatusOf(given, context);
@@ -123,7 +105,7 @@ void Client::Prepare(grpc::ClientContext& context, const google::protobuf::Messa
   context.set_deadline(deadline);
   if (!options_.token.empty()) context.AddMetadata("authorization", "Bearer " + options_.token);
   if (!options_.client_id.empty()) context.AddMetadata("x-client-id", options_.client_id);
-  if (const std::string scene = SceneOf(request); IsVisible(scene)) context.AddMetadata("x-mapless-scene", scene);
+  if (const std::string scene = SceneOf(request); !scene.empty()) context.AddMetadata("x-mapless-scene", scene);
 }
 
 template <class Stub, class Request, class Response>

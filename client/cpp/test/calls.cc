@@ -90,6 +90,13 @@ void Queries(const Client& client, const std::string& photo) {
   Check(answer.has_localization(), "a photograph is localized");
   Check(answer.localization().world_from_camera().translation_m().x() == 3, "where its reference is");
   Check(client.LocalizeProgressively(Query(photo), nullptr).has_localization(), "progressively, too");
+  auto anywhere = Query(photo);
+  anywhere.clear_scene();
+  anywhere.clear_references();
+  (*anywhere.mutable_scene_group()->mutable_labels())["site"] = "a & b";
+  Check(Fails<NotFound>([&] { client.Localize(anywhere); }, "a group of no scene").field == "scene_group", "the field is named");
+  anywhere.mutable_scene_group()->clear_labels();
+  Check(client.Localize(anywhere).scene() == "scenes/cpp", "the scene is found among all");
   v1::RetrieveReferencesRequest retrieve;
   retrieve.set_scene("scenes/cpp");
   retrieve.set_image(photo);
