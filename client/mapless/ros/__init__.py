@@ -13,7 +13,8 @@ from .camera_infos import CameraInfos, rectified_differs, says_rectified
 from .cameras import RosCamera, camera_from_info
 from .depths import Depths, RosDepth, sensor_of
 from .images import pixels_from_image
-from .localizer import Localizer, LocalizerOptions, Outcome
+from .localizer import Localizer, Outcome
+from .localizer_options import LocalizerOptions
 from .messages import Messages
 from .poses import pose_of_body, stamp_ns_of, transform_from_message, transform_from_pose
 

@@ -1,0 +1,86 @@
+"""Options of a robot's localizer."""
+
+from dataclasses import dataclass
+
+from mapless.requests import ImageSource, IntrinsicsUncertainty, ReadoutDirection
+from mapless.wire import MAX_READOUT_S, MAX_SPEED_M_PER_S, MAX_TURN_DEG_PER_S
+
+
+@dataclass(frozen=True)
+class LocalizerOptions:
+    """Options of a robot's localizer.
+
+    Attributes:
+        scene: the scene to localize in.
+        map_frame: the scene's world, as tf names it.
+        odom_frame: the frame of the odometry, for which map > odom is computed; empty without odometry.
+        base_frame: the frame whose pose is published; empty for the camera's own.
+        rate_hz: largest number of images localized per second; 0 for only those that are requested.
+        use_last_pose: whether the last answer, moved by the odometry, is a prior of the next. Errors of successive
+            answers then have a common part, so a filter must not treat them as independent.
+        coverage: see `Client.localize`.
+        timeout_s: deadline of a call.
+        sequence_length: largest number of images, 2 to 16, with which an image that is rejected alone is localized
+            together, by the odometry between them; 0 for never. This takes as long as localizing all of them.
+        mask: a PNG of the camera's size that is 0 where the camera sees the robot itself, or its path; None for none.
+        readout_s: seconds that a rolling shutter takes from the first row to the last one; 0 for a global shutter.
+        readout_direction: the side of the images that it reads first.
+        speed_m_per_s, turn_deg_per_s: standard deviations of each component of the camera's speed and angular speed
+            while it moves; 0 for the server's defaults.
+    """
+
+    scene: str
+    map_frame: str = "map"
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    rate_hz: float = 1.0
+    use_last_pose: bool = False
+    coverage: float = 0.0
+    timeout_s: float = 5.0
+    sequence_length: int = 0
+    mask: ImageSource | None = None
+    readout_s: float = 0.0
+    readout_direction: ReadoutDirection | str = ReadoutDirection.TOP_TO_BOTTOM
+    speed_m_per_s: float = 0.0
+    turn_deg_per_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.scene:
+            raise ValueError("scene is empty: name the scene to localize in")
+        if not self.map_frame or self.map_frame in (self.odom_frame, self.base_frame):
+            raise ValueError(f"map_frame must differ from odom_frame and base_frame, and is {self.map_frame!r}")
+        if not 0 <= self.rate_hz <= 1000:
+            raise ValueError(f"rate must be 0 to 1000 images a second, is {self.rate_hz:g}")
+        if not self.timeout_s > 0:
+            raise ValueError(f"timeout must be above 0 s, is {self.timeout_s:g}")
+        self._check_shutter()
+        if self.sequence_length not in (0, *range(2, 17)):
+            raise ValueError(f"sequence_length must be 0 or 2 to 16 images, is {self.sequence_length}")
+        if self.sequence_length and not self.odom_frame:
+            raise ValueError("sequence_length needs odom_frame: sequences are images with the odometry between them")
+
+    def _check_shutter(self) -> None:
+        for name, value, most, unit in (
+            ("readout_s", self.readout_s, MAX_READOUT_S, "s"),
+            ("speed_m_per_s", self.speed_m_per_s, MAX_SPEED_M_PER_S, "m/s"),
+            ("turn_deg_per_s", self.turn_deg_per_s, MAX_TURN_DEG_PER_S, "degrees/s"),
+        ):
+            if not 0 <= value <= most:
+                raise ValueError(f"{name} must be 0 to {most:g} {unit}, is {value:g}")
+            if value and not self.readout_s:
+                raise ValueError(f"{name} is of a rolling shutter, and readout_s is 0")
+        known = [it.value for it in ReadoutDirection]
+        if self.readout_direction not in known:
+            raise ValueError(f"readout_direction must be one of {', '.join(known)}, is {self.readout_direction!r}")
+
+    @property
+    def uncertainty(self) -> IntrinsicsUncertainty | None:
+        """The read-out of the images' shutter, for a request; None for a global shutter."""
+        if not self.readout_s:
+            return None
+        return IntrinsicsUncertainty(
+            readout_s=self.readout_s,
+            readout_direction=self.readout_direction,
+            speed_m_per_s=self.speed_m_per_s,
+            turn_deg_per_s=self.turn_deg_per_s,
+        )
