@@ -37,6 +37,11 @@ namespace Mapless
         /// <summary>Whether there is a pose; if not, Response.Rejection says why and what would help.</summary>
         public bool IsLocalized => Response.Localization != null;
 
+        /// <summary>
+        /// The scene in whose world the pose is, "scenes/hall": the request's, or the one that was found among several.
+        /// </summary>
+        public string Scene => Response.Scene;
+
         /// <summary>How sure it is, 0 to 1; 0 where nothing has checked it.</summary>
         public double Trust => IsLocalized && Response.Localization.HasTrust ? Response.Localization.Trust : 0;
 
@@ -228,13 +233,13 @@ namespace Mapless
         }
 
         /// <summary>
-        /// As LocalizeAsync, with all options of the request: priors, references, several axes. The calls below are likewise those
+        /// As LocalizeAsync, with all options of the request: several scenes, priors, references, several axes. The calls below are likewise those
         /// of the interface, whose comments say what their messages mean. All throw RpcException.
         /// </summary>
         public Task<LocalizeResponse> LocalizeAsync(
             LocalizeRequest request, TimeSpan timeout, CancellationToken cancellation = default)
         {
-            return CallAsync(LocalizeMethod, request, request.Scene, timeout, cancellation);
+            return CallAsync(LocalizeMethod, request, SceneOf(request), timeout, cancellation);
         }
 
         /// <summary>
@@ -253,7 +258,7 @@ namespace Mapless
             while (true)
             {
                 Server server = NextServer();
-                CallOptions options = OptionsOf(request.Scene, attempts.Deadline, cancellation);
+                CallOptions options = OptionsOf(SceneOf(request), attempts.Deadline, cancellation);
                 try
                 {
                     using (var call = server.Invoker.AsyncServerStreamingCall(LocalizeProgressivelyMethod, null, options, request))
@@ -739,6 +744,24 @@ namespace Mapless
                 ofCall.Add(header);
             }
             return new CallOptions(ofCall, deadline, cancellation);
+        }
+
+        // Of several scenes the first by name, of a group its labels: calls for the same scenes come to one server.
+        private static string SceneOf(LocalizeRequest request)
+        {
+            if (request.SceneGroup != null)
+            {
+                var labels = new List<string>();
+                foreach (var label in new SortedDictionary<string, string>(request.SceneGroup.Labels, StringComparer.Ordinal))
+                {
+                    labels.Add(Uri.EscapeDataString(label.Key) + "=" + Uri.EscapeDataString(label.Value).Replace("%20", "+"));
+                }
+                string query = string.Join("&", labels);
+                return query.Length <= 200 ? "scenes?" + query : null;
+            }
+            var scenes = new List<string>(request.Scenes);
+            scenes.Sort(StringComparer.Ordinal);
+            return scenes.Count > 0 ? scenes[0] : request.Scene;
         }
 
         private static string SceneOf(string reference)

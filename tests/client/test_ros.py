@@ -268,7 +268,7 @@ def test_a_variance_about_one_axis_stays_at_its_place(axis: int) -> None:
     small = after.rotation @ body.rotation.T
     change = np.array([*(after.translation - body.translation), small[2, 1], small[0, 2], small[1, 0]])
     np.testing.assert_allclose(covariance, np.outer(change, change), atol=1e-14)
-    message = MESSAGES.pose(Outcome(1, "OK", "", map_from_body=body, covariance=covariance), "map")
+    message = MESSAGES.pose(Outcome(1, "OK", "", map_from_body=body, covariance=covariance, map_frame="map"))
     assert message.pose.covariance[7 * axis] == covariance[axis, axis]  # ROS: x, y, z, and rotations about them
 
 
@@ -282,14 +282,14 @@ def test_published_messages_come_back_from_their_bytes() -> None:
     pose = RigidTransform(rotation_from_vector([0.1, 0.2, -0.3]), np.array([1.0, -2.0, 3.5]))
     odom = RigidTransform(np.eye(3), np.array([9.0, 8.0, 7.0]))
     outcome = Outcome(
-        1_700_000_000_000_000_001, "WARN", "why", {"reason": "X"}, "base_link", pose, covariance, ("odom", odom)
+        1_700_000_000_000_000_001, "WARN", "why", {"reason": "X"}, "base_link", pose, covariance, ("odom", odom), "map"
     )
-    filled = MESSAGES.pose(outcome, "map")
+    filled = MESSAGES.pose(outcome)
     back = sent(filled)
     assert (back.header.frame_id, stamp_ns_of(back.header.stamp)) == ("map", outcome.stamp_ns)
     assert back.pose.covariance.tolist() == list(range(36))
     np.testing.assert_allclose(transform_from_pose(back.pose.pose).matrix(), pose.matrix(), atol=1e-15)
-    (edge,) = sent(MESSAGES.tf(outcome, "map")).transforms
+    (edge,) = sent(MESSAGES.tf(outcome)).transforms
     assert (edge.header.frame_id, edge.child_frame_id) == ("map", "odom")
     np.testing.assert_allclose(transform_from_message(edge.transform).matrix(), odom.matrix(), atol=1e-15)
     (status,) = sent(MESSAGES.diagnostics(outcome, "hall")).status

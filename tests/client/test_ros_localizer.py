@@ -9,7 +9,7 @@ from support.bags import BASE_FROM_CAMERA, at, drive, image, pose_with_covarianc
 from support.images import textured
 from support.servers import CAMERA
 
-from mapless import Rejected, RigidTransform, Unavailable
+from mapless import InvalidArgument, Rejected, RigidTransform, Unavailable
 from mapless.answers import Accuracy
 from mapless.geometry import Similarity, rotation_angle_deg, rotation_from_vector
 from mapless.groups import ImageReport, SequenceFrame, SequenceLocalization
@@ -18,6 +18,7 @@ from mapless.ros import Localizer, LocalizerOptions, RosCamera, pose_of_body
 
 MAP_FROM_ODOM = RigidTransform(rotation_from_vector([0.0, 0.0, 1.2]), np.array([5.0, -3.0, 0.1]))
 COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
+ABOUT: dict[str, Any] = {"depth_check": None, "searched_scene_count": 1}
 
 
 class PlantedClient:
@@ -26,18 +27,24 @@ class PlantedClient:
     def __init__(self) -> None:
         self.priors: list[Any] = []
         self.plant: Any = None
+        self.scene = "scenes/hall"
+        self.where: list[Any] = []
 
-    def localize(self, photo: bytes, camera: Any, scene: str, *, priors: Any, capture_time: Any, **_: Any) -> Any:
+    def localize(self, photo: bytes, camera: Any, scene: str, *, priors: Any, capture_time: Any, **given: Any) -> Any:
         self.priors.append(priors.pose)
+        self.where.append((scene, *(given[it] for it in ("scenes", "group", "prior_scene"))))
         if isinstance(self.plant, Exception):
             raise self.plant
-        about = SimpleNamespace(request_id="r", total_s=0.2, queue_s=0.0, references=(), depth_check=None)
+        about = SimpleNamespace(
+            request_id="r", total_s=0.2, queue_s=0.0, references=(), depth_check=None, searched_scene_count=1
+        )
         if self.plant is not None:
             return Rejected(**({"diagnostics": about} | self.plant))
         time_s = capture_time.timestamp() - at(0) / 1e9
         pose = MAP_FROM_ODOM.compose(drive(time_s)).compose(BASE_FROM_CAMERA)
         return SimpleNamespace(
             world_from_camera=pose,
+            scene=self.scene,
             covariance=COVARIANCE,
             diagnostics=about,
             prior_checks=(),
@@ -167,6 +174,41 @@ def test_an_error_of_direction_grows_with_the_way(client: PlantedClient) -> None
     assert along @ prior.covariance[:3, :3] @ along > 0.9 * 0.8**2
 
 
+def test_among_several_scenes_each_has_its_frame(client: PlantedClient) -> None:
+    localizer = Localizer(
+        cast(Any, client), LocalizerOptions(group={}, map_frame="map_{scene}", use_last_pose=True), lookup
+    )
+    first = localizer.localize(shot(1.0), RosCamera(CAMERA))
+    client.scene = "scenes/yard"
+    second = localizer.localize(shot(2.0), RosCamera(CAMERA))
+    localizer.localize(shot(3.0), RosCamera(CAMERA))
+    assert (first.map_frame, second.map_frame) == ("map_hall", "map_yard")
+    assert [it[-1] for it in client.where] == ["", "scenes/hall", "scenes/yard"]
+    assert {it[:-1] == ("", (), {}) for it in client.where} == {True}
+    localizer.guess(pose_with_covariance(at(3.0), "map_attic", MAP_FROM_ODOM.compose(drive(3.0))), 0)
+    client.plant = InvalidArgument("INVALID_ARGUMENT", "none of them", field="prior_scene")
+    assert localizer.localize(shot(4.0), RosCamera(CAMERA)).level == "ERROR"
+    client.plant = None
+    assert localizer.localize(shot(5.0), RosCamera(CAMERA)).level == "OK"
+    assert [it[-1] for it in client.where[3:]] == ["attic", ""]
+    with pytest.raises(ValueError, match="given in frame 'map'"):
+        localizer.guess(pose_with_covariance(at(1.0), "map", MAP_FROM_ODOM), 0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"scene": "hall", "group": {}}, "only one of scene, scenes and group"),
+        ({"scenes": ["hall", "yard"]}, "map_frame must have {scene}"),
+        ({"group": {}, "map_frame": "{scene}"}, "map_frame must have {scene}"),
+        ({"group": {}, "map_frame": "map_{scene}", "sequence_length": 3}, "sequence_length needs scene"),
+    ],
+)
+def test_options_of_several_scenes_that_cannot_be_are_named(wrong: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        LocalizerOptions(**wrong)
+
+
 def test_an_initial_pose_during_a_call_is_kept(client: PlantedClient) -> None:
     localizer, answered = make(client), client.localize
 
@@ -230,7 +272,9 @@ def test_a_rejected_image_is_localized_with_those_before(client: PlantedClient) 
     def localize_sequence(frames: list[SequenceFrame], scene: str, **_: Any) -> Any:
         sent.append(frames)
         poses = tuple(MAP_FROM_ODOM.compose(it.session_from_camera) for it in frames)
-        about = SimpleNamespace(request_id="s", total_s=0.5, queue_s=0.0, references=(), depth_check=None)
+        about = SimpleNamespace(
+            request_id="s", total_s=0.5, queue_s=0.0, references=(), depth_check=None, searched_scene_count=1
+        )
         report = ImageReport(5, 9, "LOW_OVERLAP", about)  # type: ignore[arg-type]
         accuracy = Accuracy(0.01, 0.02, 0.1, 0.2, False)
         world_from_session = Similarity(1.0, np.eye(3), np.zeros(3))

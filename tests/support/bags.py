@@ -97,7 +97,7 @@ def info(camera: Camera, stamp_ns: int = BEGIN_NS, **given: Any) -> Any:
 def pose_with_covariance(stamp_ns: int, frame: str, pose: RigidTransform, covariance: ArrayLike | None = None) -> Any:
     """A geometry_msgs/PoseWithCovarianceStamped."""
     filled = np.zeros((6, 6)) if covariance is None else np.asarray(covariance, float)
-    return MESSAGES.pose(Outcome(stamp_ns, "OK", "", map_from_body=pose, covariance=filled), frame)
+    return MESSAGES.pose(Outcome(stamp_ns, "OK", "", map_from_body=pose, covariance=filled, map_frame=frame))
 
 
 def pose_stamped(stamp_ns: int, frame: str, pose: RigidTransform) -> Any:

@@ -59,6 +59,7 @@ class Outcome:
         covariance: (6, 6) of that pose, ROS's order, metres and radians about the map's fixed axes.
         tf_edge: child frame and map_from_child to publish on tf: those of the odometry, or without odometry those of
             the body; None if not localized, or if the odometry is unknown at that time.
+        map_frame: frame of the map, which is the world of the scene that the image is of; empty if not localized.
     """
 
     stamp_ns: int
@@ -69,12 +70,14 @@ class Outcome:
     map_from_body: RigidTransform | None = None
     covariance: Array | None = None
     tf_edge: tuple[str, RigidTransform] | None = None
+    map_frame: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class _Guess:
-    """A pose of the body at a time, with the odometry at that time."""
+    """A pose of the body at a time, in the world of a scene, with the odometry at that time."""
 
+    scene: str
     map_from_body: RigidTransform
     covariance: Array
     stamp_ns: int
@@ -107,10 +110,12 @@ class Localizer:
     def guess(self, message: Any, now_ns: int) -> None:
         """Uses a geometry_msgs/PoseWithCovarianceStamped of the base in the map, as of /initialpose, as a prior.
 
-        ValueError if it is given in another frame, or its numbers are not a pose.
+        Its frame says in which of several scenes. ValueError if it is given in another frame, or its numbers are not a
+        pose.
         """
         frame = message.header.frame_id.lstrip("/")
-        if frame != self._options.map_frame:
+        scene = self._options.scene_of(frame)
+        if scene is None:
             raise ValueError(f"the initial pose is given in frame {frame!r}, not in {self._options.map_frame!r}")
         map_from_base = transform_from_pose(message.pose.pose)
         covariance = np.array(message.pose.covariance, float).reshape(6, 6)
@@ -123,7 +128,7 @@ class Localizer:
         # rviz stamps with now, which odometry may not have reached yet: then its latest is as good.
         odom_from_base = self._odometry(base, stamp_ns) or self._odometry(base, 0)
         with self._lock:
-            self._guess = _Guess(map_from_base, covariance, stamp_ns, odom_from_base)
+            self._guess = _Guess(scene, map_from_base, covariance, stamp_ns, odom_from_base)
 
     def localize(self, message: Any, camera: RosCamera, find_depth: Callable[[int], RosDepth] | None = None) -> Outcome:
         """Localizes a sensor_msgs/Image or CompressedImage; a failure is an outcome, too.
@@ -149,6 +154,9 @@ class Localizer:
                 photo,
                 camera.camera,
                 self._options.scene,
+                scenes=self._options.scenes,
+                group=self._options.group,
+                prior_scene=self._used.scene if self._used is not None and priors.pose is not None else "",
                 priors=priors,
                 coverage=coverage,
                 capture_time=time_of(stamp_ns),
@@ -179,6 +187,9 @@ class Localizer:
         except LookupError as error:
             return Outcome(stamp_ns, FAILED, f"tf: {error}", frame=body)
         except (MaplessError, ValueError) as error:
+            if isinstance(error, MaplessError) and error.field == "prior_scene":  # of which the guess was given
+                with self._lock:
+                    self._guess = None if self._guess is self._used else self._guess
             return Outcome(stamp_ns, FAILED, str(error), frame=body)
         outcome = self._outcome(answer, stamp_ns, body, extrinsics, odom_from_body)
         return replace(outcome, values={**outcome.values, **about_depth})
@@ -219,7 +230,8 @@ class Localizer:
         pose, covariance = pose_of_body(map_from_camera, answer.covariance, body_from_camera)
         with self._lock:
             if self._guess is self._used:  # and not one that has come meanwhile
-                last = _Guess(pose, covariance, stamp_ns, odom_from_body)
+                scene = "" if self._options.scene or isinstance(answer, SequenceLocalization) else answer.scene
+                last = _Guess(scene, pose, covariance, stamp_ns, odom_from_body)
                 self._guess = last if self._options.use_last_pose else None
         if any(check.conflict for check in checks):
             message += "; the photograph contradicts the initial or last pose, which was not used"
@@ -230,7 +242,8 @@ class Localizer:
                 edge = (self._options.odom_frame, pose.compose(odom_from_body.inverse()))
             else:
                 message += f"; tf does not know {self._options.odom_frame} > {body} at that time"
-        return Outcome(stamp_ns, LOCALIZED, message, values, body, pose, covariance, edge)
+        map_frame = self._options.map_frame_of("" if isinstance(answer, SequenceLocalization) else answer.scene)
+        return Outcome(stamp_ns, LOCALIZED, message, values, body, pose, covariance, edge, map_frame)
 
     def _odometry(self, body: str, stamp_ns: int) -> RigidTransform | None:
         """The pose odom_from_body; None without odometry, or if it is unknown at this time."""
@@ -272,6 +285,8 @@ def _values(answer: _Answer) -> dict[str, str]:
     """The values of an answer for diagnostics; for a sequence, those of its newest image."""
     about = answer.images[-1].diagnostics if isinstance(answer, SequenceLocalization) else answer.diagnostics
     values = {"request_id": about.request_id, "server_s": f"{about.total_s:.3f}", "queue_s": f"{about.queue_s:.3f}"}
+    if not isinstance(answer, SequenceLocalization) and about.searched_scene_count > 1:
+        values["scene"] = answer.scene.rpartition("/")[2]
     values["references"] = " ".join(it.name.rpartition("/")[2] for it in about.references)
     if isinstance(answer, Rejected):
         values["reason"] = answer.reason

@@ -1,9 +1,13 @@
 """Options of a robot's localizer."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from mapless.requests import ImageSource, IntrinsicsUncertainty, ReadoutDirection
 from mapless.wire import MAX_READOUT_S, MAX_SPEED_M_PER_S, MAX_TURN_DEG_PER_S
+
+SCENE = "{scene}"
+"""In the name of the map's frame, in place of the scene's id."""
 
 
 @dataclass(frozen=True)
@@ -11,8 +15,9 @@ class LocalizerOptions:
     """Options of a robot's localizer.
 
     Attributes:
-        scene: the scene to localize in.
-        map_frame: the scene's world, as tf names it.
+        scene: the scene to localize in; empty if it is found among `scenes` or in `group`.
+        map_frame: the scene's world, as tf names it. Among several scenes each has a world, and a frame, of its own:
+            "map_{scene}", with the scene's id for {scene}.
         odom_frame: the frame of the odometry, for which map > odom is computed; empty without odometry.
         base_frame: the frame whose pose is published; empty for the camera's own.
         rate_hz: largest number of images localized per second; 0 for only those that are requested.
@@ -27,9 +32,11 @@ class LocalizerOptions:
         readout_direction: the side of the images that it reads first.
         speed_m_per_s, turn_deg_per_s: standard deviations of each component of the camera's speed and angular speed
             while it moves; 0 for the server's defaults.
+        scenes: up to 64 scenes, among which that of each image is found.
+        group: labels by name that such scenes have; {} for all.
     """
 
-    scene: str
+    scene: str = ""
     map_frame: str = "map"
     odom_frame: str = "odom"
     base_frame: str = "base_link"
@@ -43,10 +50,11 @@ class LocalizerOptions:
     readout_direction: ReadoutDirection | str = ReadoutDirection.TOP_TO_BOTTOM
     speed_m_per_s: float = 0.0
     turn_deg_per_s: float = 0.0
+    scenes: Sequence[str] = ()
+    group: Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
-        if not self.scene:
-            raise ValueError("scene is empty: name the scene to localize in")
+        self._check_scenes()
         if not self.map_frame or self.map_frame in (self.odom_frame, self.base_frame):
             raise ValueError(f"map_frame must differ from odom_frame and base_frame, and is {self.map_frame!r}")
         if not 0 <= self.rate_hz <= 1000:
@@ -58,6 +66,32 @@ class LocalizerOptions:
             raise ValueError(f"sequence_length must be 0 or 2 to 16 images, is {self.sequence_length}")
         if self.sequence_length and not self.odom_frame:
             raise ValueError("sequence_length needs odom_frame: sequences are images with the odometry between them")
+
+    def _check_scenes(self) -> None:
+        given = [bool(self.scene), bool(self.scenes), self.group is not None]
+        if not any(given):
+            raise ValueError("scene is empty: name the scene to localize in, or give scenes or a group")
+        if sum(given) > 1:
+            raise ValueError("only one of scene, scenes and group may be given")
+        if self.scene:
+            return
+        if self.map_frame.count(SCENE) != 1 or not self.map_frame.replace(SCENE, ""):
+            needed = f"map_frame must have {SCENE} among several scenes, such as map_{SCENE}: each has a world"
+            raise ValueError(f"{needed}; is {self.map_frame!r}")
+        if self.sequence_length:
+            raise ValueError("sequence_length needs scene: the images of a sequence are of one scene")
+
+    def map_frame_of(self, scene: str) -> str:
+        """The frame of a scene's world; the scene's name or id may be empty if one scene is given."""
+        return self.map_frame if self.scene else self.map_frame.replace(SCENE, scene.rpartition("/")[2])
+
+    def scene_of(self, map_frame: str) -> str | None:
+        """Id of the scene whose world is in a frame, empty if one scene is given; None if no scene's is."""
+        if self.scene:
+            return "" if map_frame == self.map_frame else None
+        before, _, after = self.map_frame.partition(SCENE)
+        scene = map_frame[len(before) : len(map_frame) - len(after)]
+        return scene if scene and map_frame == f"{before}{scene}{after}" else None
 
     def _check_shutter(self) -> None:
         for name, value, most, unit in (

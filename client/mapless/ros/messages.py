@@ -29,14 +29,14 @@ class Messages:
         """`class_of` returns a message's class by its name."""
         self._class_of = class_of
 
-    def pose(self, outcome: Outcome, map_frame: str) -> Any:
+    def pose(self, outcome: Outcome) -> Any:
         """The PoseWithCovarianceStamped of a localized image; its stamp is the image's."""
         assert outcome.map_from_body is not None
         pose = self._geometry("Pose", position="Point", orientation="Quaternion", of=outcome.map_from_body)
         # An array: serializers take no list.
         covariance = np.array(outcome.covariance, np.float64).ravel()
         filled = self._make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance)
-        return self._make(POSE_TYPE, header=self.header(outcome.stamp_ns, map_frame), pose=filled)
+        return self._make(POSE_TYPE, header=self.header(outcome.stamp_ns, outcome.map_frame), pose=filled)
 
     def transform(self, stamp_ns: int, parent: str, child: str, parent_from_child: RigidTransform) -> Any:
         """A geometry_msgs/TransformStamped."""
@@ -45,10 +45,10 @@ class Messages:
         kind = "geometry_msgs/msg/TransformStamped"
         return self._make(kind, header=header, child_frame_id=child, transform=transform)
 
-    def tf(self, outcome: Outcome, map_frame: str) -> Any:
+    def tf(self, outcome: Outcome) -> Any:
         """The TFMessage of a localized image."""
         assert outcome.tf_edge is not None
-        return self._make(TF_TYPE, transforms=[self.transform(outcome.stamp_ns, map_frame, *outcome.tf_edge)])
+        return self._make(TF_TYPE, transforms=[self.transform(outcome.stamp_ns, outcome.map_frame, *outcome.tf_edge)])
 
     def diagnostics(self, outcome: Outcome, hardware_id: str) -> Any:
         """The DiagnosticArray of an image: why it was not localized, or how well it was."""

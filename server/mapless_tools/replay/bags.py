@@ -194,10 +194,10 @@ class _Output:
         self._put(DIAGNOSTICS_TOPIC, time_ns, self._messages.diagnostics(outcome, self._options.scene))
         if outcome.map_from_body is None:
             return
-        self._put(POSE_TOPIC, time_ns, self._messages.pose(outcome, self._options.map_frame))
+        self._put(POSE_TOPIC, time_ns, self._messages.pose(outcome))
         if outcome.tf_edge is None:
             return
-        tf = self._messages.tf(outcome, self._options.map_frame)
+        tf = self._messages.tf(outcome)
         if odom := self._options.odom_frame:
             pose = tree.lookup(odom, outcome.frame, images.time_s(outcome.stamp_ns))
             tf.transforms.append(self._messages.transform(outcome.stamp_ns, odom, outcome.frame, pose))

@@ -22,11 +22,14 @@ from std_srvs.srv import Trigger
 import mapless
 import mapless.ros
 from mapless.geometry import RigidTransform
+from mapless.labels import parse_labels
 from mapless.text_files import read_text
 
 PARAMETERS: dict[str, Any] = {
     "address": "localhost:50051",
     "scene": "",
+    "scenes": "",
+    "group": "",
     "token_file": "",
     "tls": False,
     "ca": "",
@@ -70,6 +73,8 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         self._given = {name: self.declare_parameter(name, value).value for name, value in PARAMETERS.items()}
         options = mapless.ros.LocalizerOptions(
             scene=self._given["scene"],
+            scenes=[it for it in self._given["scenes"].split(",") if it],
+            group=self._group(),
             map_frame=self._given["map_frame"],
             odom_frame=self._given["odom_frame"],
             base_frame=self._given["base_frame"],
@@ -99,7 +104,7 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
             kind_of_sensor = mapless.ros.sensor_of(self._given["depth_sensor"])
             self._depths = mapless.ros.Depths(kind_of_sensor, self._given["depth_tolerance"])
         self._image: Any = None
-        self._edge: tuple[str, RigidTransform] | None = None
+        self._edge: tuple[str, str, RigidTransform] | None = None
         self._is_triggered = self._is_closed = False
         self._changed = threading.Condition()
         kind = CompressedImage if self._given["compressed"] else Image
@@ -127,6 +132,10 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         self._client.close()
         self._thread.join()
         super().destroy_node()
+
+    def _group(self) -> dict[str, str] | None:
+        given = self._given["group"]
+        return None if not given else {} if given == "*" else parse_labels(given.split(","), "group")
 
     def _connect_options(self) -> mapless.ConnectOptions:
         ca, token_file = self._given["ca"], self._given["token_file"]
@@ -216,17 +225,16 @@ class MaplessNode(rclpy.node.Node):  # type: ignore[misc]
         if outcome.map_from_body is None:
             self.get_logger().warning(f"not localized: {outcome.message}", throttle_duration_sec=5.0)
             return
-        self._pose.publish(self._messages.pose(outcome, self._given["map_frame"]))
+        self._pose.publish(self._messages.pose(outcome))
         if outcome.tf_edge is not None:
-            self._edge = outcome.tf_edge
+            self._edge = (outcome.map_frame, *outcome.tf_edge)
 
     def _broadcast(self) -> None:
         """Repeats the last map > odom with the present time, for nodes that need the present pose."""
         if self._edge is None:
             return
-        child, map_from_child = self._edge
+        parent, child, map_from_child = self._edge
         stamp_ns = self.get_clock().now().nanoseconds + round(1e9 * self._given["transform_tolerance"])
-        parent = self._given["map_frame"]
         self._broadcaster.sendTransform(self._messages.transform(stamp_ns, parent, child, map_from_child))
 
     def _lookup(self, target: str, source: str, stamp_ns: int) -> RigidTransform:
