@@ -383,3 +383,16 @@ class TestPages:
             html = (tmp_path / f"pages/{name}.html").read_text()
             assert sentence in html
             assert ("inliers on points that it shows, 90" in html) == (calls == 4)
+
+
+def test_the_page_names_the_scene_that_was_found_among_several() -> None:
+    """The plan is of its world: a hypothesis in another scene's is listed, and not drawn."""
+    about = replace(diagnostics(), searched_scene_count=12)
+    page = answer_page("photo", localized(scene="scenes/yard", diagnostics=about), PHOTO, CAMERA)
+    assert "yard, found among 12" in page
+    places = [Hypothesis(truth(), 30, (), scene=f"scenes/{it}") for it in ("yard", "hall")]
+    page = answer_page(
+        "photo", rejected(scene="scenes/yard", hypotheses=tuple(places), diagnostics=about), PHOTO, CAMERA
+    )
+    assert ">yard</td>" in page
+    assert ">hall</td>" in page

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mapless import Camera, LocalizationResult, Reference, Rejected
 from mapless.answers import POINT_SOURCES
-from mapless.diagnostics import Debug, Diagnostics
+from mapless.diagnostics import Debug
 from mapless.lenses import lens_model_of
 from mapless.names import reference_name
 from mapless_server.errors import InvalidArgument
@@ -85,7 +85,7 @@ def answer_page(
         pairs=_pairs(answer, image, camera, known),
         svgs=_charts(answer, camera, known, down_in_world),
         tables=[it for it in _tables(answer) if it.rows],
-        provenance=_facts(answer.diagnostics, camera),
+        provenance=_facts(answer, camera),
     )
 
 
@@ -175,7 +175,7 @@ def _charts(
     found = (
         [answer.world_from_camera]
         if isinstance(answer, LocalizationResult)
-        else [it.world_from_camera for it in answer.hypotheses]
+        else [it.world_from_camera for it in answer.hypotheses if it.scene == answer.scene]
     )
     used = {it.name for it in answer.diagnostics.references if it.match_count}
     if not used and not found:
@@ -214,7 +214,7 @@ def _tables(answer: Answer) -> list[Table]:
     used = answer.diagnostics
     tables = []
     if isinstance(answer, Rejected):
-        tables.append(Table("Where it could be", ("x, y, z", "inliers", "supported by"), _hypotheses(answer)))
+        tables.append(Table("Where it could be", ("x, y, z", "inliers", "supported by", "scene"), _hypotheses(answer)))
     elif answer.covariance is not None:
         sigmas = np.sqrt(np.maximum(np.diag(answer.covariance), 0.0))
         rows = [
@@ -263,13 +263,16 @@ def _hypotheses(answer: Rejected) -> list[list[str]]:
             ", ".join(f"{v:.3f}" for v in it.world_from_camera.translation),
             str(it.inlier_count),
             ", ".join(name.rpartition("/")[2] for name in it.references),
+            it.scene.rpartition("/")[2],
         ]
         for it in answer.hypotheses
     ]
 
 
-def _facts(used: Diagnostics, camera: Camera) -> dict[str, str]:
+def _facts(answer: LocalizationResult | Rejected, camera: Camera) -> dict[str, str]:
     """Software, options and inputs, by name."""
+    used = answer.diagnostics
+    among = f", found among {used.searched_scene_count}" if used.is_among_several else ""
     lens = "none"
     if camera.distortion is not None:
         values = ", ".join(f"{name} {value:g}" for name, value in vars(camera.distortion).items() if value)
@@ -280,6 +283,7 @@ def _facts(used: Diagnostics, camera: Camera) -> dict[str, str]:
         "backend": used.backend + (f", weights {used.weights_sha256[:12]}" if used.weights_sha256 else ""),
         "variant": used.variant.lower(),
         "references chosen by": used.retrieval or "the caller",
+        **({"scene": answer.scene.rpartition("/")[2] + among} if answer.scene else {}),
         "scene's generation": str(used.store_generation),
         "photograph": f"{size}, processed as {used.processed_width_px} x {used.processed_height_px}",
         "focal lengths": f"{camera.focal_x_px:.1f}, {camera.focal_y_px:.1f} px",
