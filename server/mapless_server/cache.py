@@ -47,6 +47,11 @@ class LruCache(Generic[Value]):
             self.used -= size
             return value
 
+    def values(self) -> list[Value]:
+        """The values held, the least recently used first; not counted as a use."""
+        with self._lock:
+            return [value for value, _ in self._entries.values()]
+
     def forget(self, is_gone: Callable[[Any, Value], bool]) -> list[Any]:
         """Drops the entries for which `is_gone(key, value)` is true; returns their keys.
 

@@ -42,12 +42,12 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def default_weights_dir() -> Path:
-    """A folder in the user's cache, because weights can be fetched again; without a cache, one beside the store."""
+def cache_dir(name: str) -> Path:
+    """A folder in the user's cache, for what can be made or fetched again; without a cache, one beside the store."""
     cache = os.environ.get("XDG_CACHE_HOME", "")
     if not os.path.isabs(cache):  # the XDG specification: relative ones are ignored
         cache = os.path.expanduser("~/.cache")
-    return Path(cache) / "mapless" / "weights" if os.path.isabs(cache) else Path("mapless-weights")
+    return Path(cache) / "mapless" / name if os.path.isabs(cache) else Path(f"mapless-{name}")
 
 
 class Settings(BaseModel):
@@ -71,7 +71,7 @@ class Settings(BaseModel):
     """Local features; superpoint is for research only."""
     device: str = "auto"
     """Device of networks: auto, cpu, cuda or cuda:N."""
-    weights_dir: Path = Field(default_factory=default_weights_dir)
+    weights_dir: Path = Field(default_factory=lambda: cache_dir("weights"))
     """Folder of the networks' weights."""
     reference_depth: str = Field(default=OFF, json_schema_extra={"enum": [OFF, STORED, *NETWORKS]})
     """Depth kept with references, for the backend geometric: off, stored (others make it), or the network that does."""
@@ -105,6 +105,8 @@ class Settings(BaseModel):
     """Descriptors by which references are chosen; vlad is made of the local features."""
     retrieval_cache_mib: int = Field(default=1024, ge=1)
     """Memory for the scenes whose references are chosen, MiB."""
+    index_dir: Path | None = None
+    """Folder of the indexes of scenes with 100,000 references or more, on a local disk."""
     reference_cache_mib: int = Field(default=512, ge=0)
     """Memory for references' features, MiB."""
     background_matching: bool = True
@@ -182,7 +184,14 @@ class Settings(BaseModel):
         return host
 
     @field_validator(
-        "data_dir", "weights_dir", "tls_certificate", "tls_key", "tls_client_ca", "tokens_file", "capture_dir"
+        "data_dir",
+        "weights_dir",
+        "tls_certificate",
+        "tls_key",
+        "tls_client_ca",
+        "tokens_file",
+        "capture_dir",
+        "index_dir",
     )
     @classmethod
     def _check_path(cls, path: Path | None) -> Path | None:
@@ -249,7 +258,11 @@ _PASSWORD = re.compile(r"(:/+[^/@:]*:).+(?=@)", re.DOTALL)
 """In a URL; a path has only one slash of its two. An @ and a line break may be in the password."""
 _REMOVED = {"query_rays": "networks that take intrinsics always get the photograph's own; leave it out"}
 """Former settings, and what to do instead."""
-_COMPUTED_DEFAULTS = {"workers": "all cores", "weights_dir": "~/.cache/mapless/weights"}
+_COMPUTED_DEFAULTS = {
+    "workers": "all cores",
+    "weights_dir": "~/.cache/mapless/weights",
+    "index_dir": "indexes in data_dir; with a database_url, ~/.cache/mapless/indexes",
+}
 
 
 def _exceeds(settings: Settings, less: str, more: str) -> str:

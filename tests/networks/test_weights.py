@@ -30,7 +30,7 @@ from mapless_server.networks.weights import (
 from mapless_server.networks.weights.catalogue import HubFile, Licence, LookAlike, Weights
 from mapless_server.networks.weights.folder import Status, look_up
 from mapless_server.networks.weights.install import add, check, fetch
-from mapless_server.settings import Settings, default_weights_dir
+from mapless_server.settings import Settings, cache_dir
 
 # ---- the catalogue and the folder
 
@@ -85,13 +85,13 @@ def test_a_folder_in_place_of_a_file_is_reported_first(
 
 def test_the_default_folder_is_the_users_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", "/var/cache/somebody")
-    assert default_weights_dir() == Path("/var/cache/somebody/mapless/weights")
+    assert cache_dir("weights") == Path("/var/cache/somebody/mapless/weights")
     for ignored in ("", "relative"):
         monkeypatch.setenv("XDG_CACHE_HOME", ignored)
         monkeypatch.setenv("HOME", "/home/somebody")
-        assert default_weights_dir() == Path("/home/somebody/.cache/mapless/weights")
+        assert cache_dir("weights") == Path("/home/somebody/.cache/mapless/weights")
     monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # as for a user without a home
-    assert default_weights_dir() == Path("mapless-weights")
+    assert cache_dir("weights") == Path("mapless-weights")
 
 
 @pytest.mark.parametrize("device", ["", "gpu", "cuda:", "cuda:x", "cpu:0", "CUDA"])

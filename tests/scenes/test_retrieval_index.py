@@ -1,16 +1,26 @@
 """The index of a scene: equal to a brute-force twin under any changes, and consistent for readers while it changes."""
 
+import tempfile
 import threading
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from support.scenes import random_for, unit_rows
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.scenes.retrieval import index as retrieval_index
 from mapless_server.scenes.retrieval.index import SceneIndex
+from mapless_server.scenes.retrieval.index_file import Identity, IndexFile
+from mapless_server.scenes.retrieval.index_writer import Content, Making, write_index
+from mapless_server.scenes.retrieval.lists import ListOptions
+from mapless_server.scenes.retrieval.narrowing import Narrowing, Sphere
+from mapless_server.scenes.retrieval.ranking import Selection, rank_references
 from mapless_server.store import IndexedReference, SceneChanges
 
 DIMENSION = 24
@@ -93,12 +103,25 @@ STEPS = st.lists(
 )
 
 
+def filed(references: Iterable[IndexedReference], generation: int) -> SceneIndex:
+    """An index whose file has these references."""
+    identity = Identity("store", "scene", 1, "descriptor", DIMENSION)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / identity.file_name()
+        making = Making(ListOptions(rows_per_list=4))
+        write_index(path, Content(identity, generation, "", [tuple(references)]), making)
+        return SceneIndex(DIMENSION, IndexFile(path, identity))
+
+
 @settings(deadline=None, max_examples=40)
 @given(STEPS)
 def test_any_changes_leave_what_they_leave_in_a_dictionary(
     steps: list[tuple[list[tuple[int, bool]], set[int], int]],
 ) -> None:
-    """Adds (some without descriptor), removals (some of what never was), descriptors that come later, scenes anew."""
+    """Adds (some without descriptor), removals (some of what never was), descriptors that come later, scenes anew.
+
+    Now and then the scene is written to a file, and goes on from it.
+    """
     index, slow = SceneIndex(DIMENSION), SlowIndex()
     gone: set[int] = set()
     for generation, (adds, removes, kind) in enumerate(steps):
@@ -110,13 +133,18 @@ def test_any_changes_leave_what_they_leave_in_a_dictionary(
         gone |= removes | (set(present) if kind == 0 else set())
         index.apply(changes)
         slow.apply(changes)
+        if kind == 9 and slow.by_key:
+            index = filed(slow.by_key.values(), generation)
         assert index.generation == generation
         assert_same(index, slow)
 
 
-def test_entries_stay_as_they_were() -> None:
+@pytest.mark.parametrize("is_filed", [False, True])
+def test_entries_stay_as_they_were(is_filed: bool) -> None:
+    references = [reference(i, described=i > 0) for i in range(300)]
     index = SceneIndex(DIMENSION)
-    index.apply(whole(*(reference(i, described=i > 0) for i in range(300))))
+    index.apply(whole(*references))
+    index = filed(references, 1) if is_filed else index
     before = index.entries()
     rows, similarities = before.rows(), before.similarities(QUERY, before.rows())
     index.describe({"key-0": POOL[5]})
@@ -195,3 +223,48 @@ def test_memory_follows_what_is_held() -> None:
     assert 512 + 96 < per_reference < 512 + 600
     index.apply(change(2, removed=frozenset(it.key for it in many[:-10])))
     assert index.size_bytes < 0.1 * per_reference * len(many)
+
+
+class TestFiles:
+    """What a file adds."""
+
+    @staticmethod
+    def places(count: int) -> tuple[list[IndexedReference], list[NDArray[np.float32]]]:
+        """References at 40 places, and photographs taken there."""
+        random = random_for("places")
+        centres = random.standard_normal((40, DIMENSION))
+        views = unit_rows(centres[np.arange(count) % 40] + 0.4 * random.standard_normal((count, DIMENSION)))
+        queries = unit_rows(centres + 0.4 * random.standard_normal((40, DIMENSION)))
+        references = [
+            IndexedReference(f"id-{i}", f"key-{i}", pose(i), view) for i, view in enumerate(views.astype(np.float32))
+        ]
+        return references, [*queries.astype(np.float32)]
+
+    def test_of_a_small_scene_ranks_as_memory_does(self) -> None:
+        references, queries = self.places(400)
+        in_memory, in_file = SceneIndex(DIMENSION), filed(references[:300], 1)
+        in_memory.apply(whole(*references[:300]))
+        later = change(2, tuple(references[300:]), frozenset(f"key-{i}" for i in range(0, 300, 7)))
+        for index in (in_memory, in_file):
+            index.apply(later)
+        near = Narrowing(position=Sphere(np.array([200.0, 2.0, -200.0]), 40.0))
+        named = [f"id-{i}" for i in range(100, 350)]
+        for query in queries:
+            for selection in (Selection(10), Selection(10, near), Selection(10, among=named)):
+                expected, found = (rank_references(it.entries(), query, selection) for it in (in_memory, in_file))
+                assert [(it.reference_id, it.key) for it in found] == [(it.reference_id, it.key) for it in expected]
+                assert [it.similarity for it in found] == pytest.approx([it.similarity for it in expected], abs=1.01e-4)
+
+    def test_of_a_large_one_finds_what_all_comparisons_find(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(retrieval_index, "CONSIDERED", 300)
+        references, queries = self.places(4000)
+        entries = filed(references, 1).entries()
+        rows = entries.rows()
+        right = 0
+        for query in queries:
+            exact, similar = entries.similarities(query, rows), entries.similar(query, rows, 10)
+            assert 300 <= len(similar.rows) < 800
+            np.testing.assert_allclose(similar.similarity, exact[similar.rows], atol=1e-6)
+            assert similar.typical == pytest.approx(float(np.median(exact)), abs=0.1)
+            right += len({*rows[np.argsort(-exact)[:10]]} & {*similar.rows[np.argsort(-similar.similarity)[:10]]})
+        assert right >= 0.97 * 10 * len(queries)

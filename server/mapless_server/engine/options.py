@@ -1,6 +1,7 @@
 """Options of the engine."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from mapless_server.bounds import check_bounds
 from mapless_server.images import ImageLimits
@@ -17,6 +18,7 @@ class EngineOptions:
         max_batch: largest number of queries that a network reconstructs together.
         image_limits: limits of the images that are decoded.
         index_cache_bytes: memory for the scenes' indexes, by which references are chosen.
+        index_dir: folder of the index files of large scenes; None searches these in memory.
         doubt: when an accepted pose is doubtful, so that further attempts are made.
         coverage: share of right answers to accept where a request does not say.
         queue: options of the work queue.
@@ -26,6 +28,7 @@ class EngineOptions:
     max_batch: int = 4
     image_limits: ImageLimits = field(default_factory=ImageLimits)
     index_cache_bytes: int = 1024 * 2**20
+    index_dir: Path | None = None
     doubt: DoubtOptions = field(default_factory=DoubtOptions)
     coverage: float = 0.95
     queue: WorkQueueOptions = field(default_factory=WorkQueueOptions)

@@ -16,6 +16,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.method.structure.measured_depth import median_depth
 from mapless_server.scenes import Choice, RankedReference, Selection, rank_references
 from mapless_server.scenes.audit.scene_auditor import SceneAuditor, SceneTools
+from mapless_server.scenes.index_files import again_if_damaged
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.later import Pending
 from mapless_server.scenes.library import FeaturesMissing
@@ -90,6 +91,16 @@ class References:
         reference (field "references[i]"); DataLoss if a named reference is damaged (same field); InvalidArgument if
         the image is bad.
         """
+        return again_if_damaged(lambda: self._choose(scene_key, views, selection, context, extractor))
+
+    def _choose(
+        self,
+        scene_key: SceneKey,
+        views: QueryViews,
+        selection: Selection,
+        context: StageContext,
+        extractor: FeatureExtractor | None,
+    ) -> Choice:
         # The scene comes first: a wrong name is found before the photograph is described.
         main, own = self.retrievals[0], self._retrieval_of(extractor)
         entries = main.indexes.entries(scene_key, context)
@@ -122,6 +133,11 @@ class References:
         Returns:
             The scenes that exist and can be read, in order, and the references of each, the most similar first.
         """
+        return again_if_damaged(lambda: self._choose_among(questions, views, count, context))
+
+    def _choose_among(
+        self, questions: Sequence[SceneQuestion], views: QueryViews, count: int, context: StageContext
+    ) -> Sequence[tuple[SceneQuestion, Sequence[RankedReference]]]:
         main = self.retrievals[0]
         with context.stage("retrieval"):
             read = [it for question in questions if (it := self._entries_of(question, context)) is not None]
@@ -221,7 +237,14 @@ class References:
         """Memory of the retrieval indexes, bytes."""
         return sum(it.indexes.size_bytes for it in self.retrievals)
 
+    @property
+    def index_file_bytes(self) -> list[int]:
+        """Sizes of the index files in use, of scenes that are searched approximately, bytes."""
+        return [size for it in self.retrievals for size in it.indexes.filed]
+
     def close(self) -> None:
-        """Ends the background work of the library and of the agreements."""
+        """Ends the background work of the indexes, of the library and of the agreements."""
+        for it in self.retrievals:
+            it.indexes.close()
         self.agreements.close()
         self._tools.library.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -23,6 +23,7 @@ class Scraped(Collector):
     Attributes:
         reference_cache: returns the cache of references' features.
         retrieval_index: returns the size of the scenes in memory, bytes.
+        index_files: returns the sizes of the index files in use, bytes.
         token_cache: returns the counters of the cache of references' tokens.
         gpu_memory: returns bytes by kind: allocated, reserved, peak.
         certificate_expiry: returns when the certificate expires, Unix seconds.
@@ -33,6 +34,7 @@ class Scraped(Collector):
     def __init__(self) -> None:
         self.reference_cache: Callable[[], LruCache[Any]] | None = None
         self.retrieval_index: Callable[[], int] | None = None
+        self.index_files: Callable[[], Sequence[int]] | None = None
         self.token_cache: Callable[[], TokenCacheCounters] | None = None
         self.gpu_memory: Callable[[], Mapping[str, float]] | None = None
         self.certificate_expiry: Callable[[], float] | None = None
@@ -45,7 +47,7 @@ class Scraped(Collector):
 
     def collect(self) -> Iterable[Metric]:
         """Implements Collector."""
-        of_caches = self._reference_cache, self._retrieval_index, self._token_cache
+        of_caches = self._reference_cache, self._retrieval_index, self._index_files, self._token_cache
         for add_to in (*of_caches, self._gpu_memory, self._certificate, self._connections):
             metrics: dict[str, Metric] = {}
             try:
@@ -70,6 +72,16 @@ class Scraped(Collector):
         size = _gauge(metrics, "mapless_retrieval_index_bytes", "Size of the scenes held to choose references by.")
         if self.retrieval_index is not None:
             size.add_metric([], self.retrieval_index())
+
+    def _index_files(self, metrics: dict[str, Metric]) -> None:
+        count = _gauge(
+            metrics, "mapless_retrieval_index_files", "Large scenes in use that are searched by an index file."
+        )
+        size = _gauge(metrics, "mapless_retrieval_index_file_bytes", "Size of these files on the disk.")
+        if self.index_files is not None:
+            sizes = self.index_files()
+            count.add_metric([], len(sizes))
+            size.add_metric([], sum(sizes))
 
     def _token_cache(self, metrics: dict[str, Metric]) -> None:
         hits = _counter(metrics, "mapless_token_cache_hits", "Tokens found, by where.", ["tier"])

@@ -6,7 +6,8 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
 from mapless_server.store import GroupedScene, Store
 
+from .index_files import IndexFiles, again_if_damaged
 from .library import KeyedLocks, Loaded, ReferenceLibrary, load_usable
 from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 
@@ -39,16 +41,19 @@ class SceneIndexes:
         descriptor: GlobalDescriptor,
         extractor: FeatureExtractor,
         capacity_bytes: int,
+        files: IndexFiles | None = None,
     ) -> None:
         """Makes the object without any index.
 
         The library loads references that have no descriptor yet, with the extractor's features, from which descriptors
         are computed. All indexes have at most `capacity_bytes`; the most recently used one is kept however large it is.
+        Large scenes are in files, if these are given.
         """
         self._store = store
         self._library = library
         self._descriptor = descriptor
         self._extractor = extractor
+        self._files = files
         self._cached: LruCache[_CachedIndex] = LruCache(capacity_bytes, keeps_latest=True)
         self._extents: LruCache[tuple[int, float]] = LruCache(REMEMBERED_EXTENTS)
         self._lock = threading.Lock()
@@ -68,6 +73,11 @@ class SceneIndexes:
         return self._cached.used
 
     @property
+    def filed(self) -> list[int]:
+        """Sizes of the index files in use, bytes."""
+        return [it.index.file.size_bytes for it in self._cached.values() if it.index.file is not None]
+
+    @property
     def locks(self) -> KeyedLocks:
         """Locks of what is being computed of references, see `ReferenceLibrary`."""
         return self._library.locks
@@ -79,10 +89,14 @@ class SceneIndexes:
         cancelled; if `waits` is False they remain without. So does one that cannot be described because it is damaged.
         NotFound if there is no such scene (field "scene"); Abandoned if the context is cancelled.
         """
+        return again_if_damaged(lambda: self._current(scene_key, context, waits))
+
+    def _current(self, scene_key: SceneKey, context: StageContext, waits: bool) -> Entries:
         # Even if the scene is evicted meanwhile, this call continues with the same index.
         cached = self._get(scene_key)
         while True:
             self._refresh(scene_key, cached)
+            self._consider(scene_key, cached)
             undescribed = self._undescribed(cached)
             if not undescribed or not waits:
                 return cached.index.entries()
@@ -130,9 +144,16 @@ class SceneIndexes:
         return [it for it in undescribed if it[1] not in stored]
 
     def forget(self, scene_key: SceneKey) -> None:
-        """Frees the index of a deleted scene."""
+        """Frees the index of a deleted scene, and deletes its file."""
         with self._lock:
             self._cached.forget(lambda key, _: key == scene_key)
+        if self._files is not None:
+            self._files.discard(scene_key)
+
+    def close(self) -> None:
+        """Ends the work on files."""
+        if self._files is not None:
+            self._files.close()
 
     def is_damaged(self, scene_key: SceneKey, reference_id: str) -> bool:
         """Whether a reference is missing from the entries of its scene because its pose or descriptor is damaged."""
@@ -219,6 +240,7 @@ class SceneIndexes:
             entries = cached.refresh(self._store, scene_key, self._descriptor.name)
         except Exception:
             # An index that cannot be updated is not valid, and that of a deleted scene wastes memory.
+            self._discard_damaged(scene_key, cached)
             with self._lock:
                 self._cached.forget(lambda _, it: it is cached)
             raise
@@ -231,14 +253,31 @@ class SceneIndexes:
             self._extents.put(scene_key, (entries.generation, float(distances_m.max(initial=0.0))), 1)
         return entries
 
+    def _consider(self, scene_key: SceneKey, cached: _CachedIndex) -> None:
+        if self._files is not None:
+            adopt = partial(cached.adopt, self._store, scene_key, self._descriptor.name)
+            self._files.consider(scene_key, cached.index.entries(), adopt)
+
+    def _discard_damaged(self, scene_key: SceneKey, cached: _CachedIndex) -> None:
+        if self._files is not None and cached.is_damaged:
+            log.error("the index file of scene %s is damaged, and is made again", scene_key)
+            self._files.discard(scene_key)
+
     def _get(self, scene_key: SceneKey) -> _CachedIndex:
-        """Returns the scene's index, created if missing."""
-        with self._lock:
-            cached = self._cached.get(scene_key)
-            if cached is None:
-                cached = _CachedIndex(SceneIndex(self._descriptor.dimension))
-                self._cached.put(scene_key, cached, 0)
+        """Returns the scene's index, created if missing, or if its file is damaged."""
+        cached = self._cached.get(scene_key)
+        if cached is not None and not cached.is_damaged:
             return cached
+        if cached is not None:
+            self._discard_damaged(scene_key, cached)
+        opened = None if self._files is None else self._files.open(scene_key) or self._files.read(scene_key)
+        with self._lock:
+            found = self._cached.get(scene_key)
+            if found is not None and found is not cached:  # another thread was faster
+                return found
+            new = _CachedIndex(*(opened or (SceneIndex(self._descriptor.dimension), ())))
+            self._cached.put(scene_key, new, 0)
+            return new
 
 
 class _CachedIndex:
@@ -248,12 +287,26 @@ class _CachedIndex:
     keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged.
     """
 
-    def __init__(self, index: SceneIndex) -> None:
+    def __init__(self, index: SceneIndex, damaged_ids: Iterable[str] = ()) -> None:
         self.index = index
-        self.damaged_ids: set[str] = set()
+        self.damaged_ids = set(damaged_ids)
         self.undescribable: set[str] = set()
         self.reported_ids: set[str] = set()
         self.updating = threading.Lock()
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether the index uses a file in which damage was found."""
+        return self.index.file is not None and self.index.file.is_damaged
+
+    def adopt(self, store: Store, scene_key: SceneKey, descriptor: str, index: SceneIndex) -> None:
+        """Replaces the index by one that was just opened, with what has changed since."""
+        with self.updating:
+            changes = store.list_changes(scene_key, index.generation, descriptor)
+            if changes.generation != index.generation:
+                index.apply(changes)
+            self.damaged_ids.update(changes.damaged)
+            self.index = index
 
     def describable(self, entries: Entries) -> list[tuple[str, str]]:
         """Id and key of the entries that have no descriptor but may get one."""

@@ -6,6 +6,7 @@ Nothing here imports torch unless the settings name a network.
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from mapless_server.choices import OFF, STORED
 from mapless_server.engine.options import EngineOptions
@@ -26,6 +27,7 @@ from mapless_server.scenes.background import BackgroundMatching, SceneWork
 from mapless_server.scenes.calibration.calibrator import Calibrator, SceneCalibrations
 from mapless_server.scenes.depth.scene_depths import DepthMaker, SceneDepths
 from mapless_server.scenes.depth_checks import DepthChecks
+from mapless_server.scenes.index_files import IndexFiles
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.later import LaterFeatures
 from mapless_server.scenes.library import ReferenceLibrary
@@ -36,7 +38,7 @@ from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.scenes.stored import DepthFinder, PairFinder, TierMatching
 from mapless_server.scheduling import Observer, Quota, WorkQueueOptions
 from mapless_server.security import RateLimiter
-from mapless_server.settings import Settings
+from mapless_server.settings import Settings, cache_dir
 from mapless_server.store import Store
 from mapless_server.store.depths import depth_kind
 from mapless_server.store.pairs import PairStore
@@ -64,6 +66,7 @@ def engine_options(settings: Settings) -> EngineOptions:
         workers=settings.workers,
         max_batch=settings.max_batch,
         index_cache_bytes=settings.retrieval_cache_mib * 2**20,
+        index_dir=_index_dir(settings),
         image_limits=image_limits(settings),
         coverage=settings.coverage,
         queue=WorkQueueOptions(
@@ -72,6 +75,13 @@ def engine_options(settings: Settings) -> EngineOptions:
             stall_limit_s=settings.stall_limit_s,
         ),
     )
+
+
+def _index_dir(settings: Settings) -> Path:
+    """The folder of the index files of large scenes: beside the store, or in the user's cache where that is shared."""
+    if settings.index_dir is not None:
+        return settings.index_dir
+    return settings.data_dir / "indexes" if settings.database_url is None else cache_dir("indexes")
 
 
 def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateLimiter | None) -> QueueEngine:
@@ -123,13 +133,18 @@ def engine_over(store: Store, tiers: Sequence[Tier], options: EngineOptions, par
     library = ReferenceLibrary(store, depths if any(tier.uses_depths for tier in tiers) else None)
     any_roll = [tier for tier in tiers[1:] if tier.any_roll]
     capacity_bytes = options.index_cache_bytes // (1 + len(any_roll))
-    indexes = SceneIndexes(store, library, descriptor, first, capacity_bytes)
+
+    def indexes_by(by: GlobalDescriptor, extractor: FeatureExtractor) -> SceneIndexes:
+        files = None
+        if options.index_dir is not None:
+            files = IndexFiles(store, by, options.index_dir, lambda: library.is_idle(), observed)
+        return SceneIndexes(store, library, by, extractor, capacity_bytes, files)
+
+    indexes = indexes_by(descriptor, first)
     retrievals = [Retrieval(descriptor, first, indexes)]
     for tier in any_roll:  # photographs that are rolled resemble references by these features alone
         own = VladDescriptor.of(tier.extractor)
-        retrievals.append(
-            Retrieval(own, tier.extractor, SceneIndexes(store, library, own, tier.extractor, capacity_bytes))
-        )
+        retrievals.append(Retrieval(own, tier.extractor, indexes_by(own, tier.extractor)))
     matcher = tiers[0].pipeline.matcher
     pairs = PairMatches(matcher.options.reference_ratio, CACHED_AUDIT_PAIRS)
     # References that are rolled against one another agree only by what matches at any roll.

@@ -321,6 +321,7 @@ def _observe_engine(engine: QueueEngine, metrics: Metrics) -> None:
     first = engine.tiers[0]
     metrics.built(__version__, first.backend, first.features, first.weights_sha256)
     metrics.scraped.retrieval_index = lambda: engine.references.index_bytes
+    metrics.scraped.index_files = lambda: engine.references.index_file_bytes
     metrics.watch_queue(engine.queue.load)
     metrics.scraped.gpu_memory = gpu_memory
     cache = getattr(first.pipeline.reconstructor, "cache", None)  # of tokens; networks have one

@@ -1,18 +1,14 @@
-"""A scene's descriptors and poses in memory: updated by what has changed, read without locks.
+"""A scene's descriptors and poses: updated by what has changed, read without locks.
 
-The search is exact: every reference's similarity is computed, so nothing is missed and nothing has to be trained. It is
-bounded by memory bandwidth. Descriptors are held as 8-bit integers with the norm of each row, which takes a quarter of
-float32's memory in the same time (parts of the matrix are converted to float32 in the processor's cache) and changes a
-similarity by less than 0.002. A reference takes D bytes and about 0.35 KB for its pose and its names: with 1024 numbers
-1.4 KB, 1.4 GB for a million. One core of a busy machine ranks 1,000 references in 1 ms, 10,000 in 4 and 100,000 in 33;
-a million take a third of a second.
+A scene is in memory, and its search is exact: every reference's similarity is computed, so nothing is missed and
+nothing has to be trained. It is bounded by memory bandwidth. Descriptors are held as 8-bit integers with the norm of
+each row, see `quantizing`. A reference takes D bytes and about 0.35 KB for its pose and its names: with 1024 numbers
+1.4 KB. One core of a busy machine ranks 1,000 references in 1 ms, 10,000 in 4 and 100,000 in 33.
 
-Beyond a million references per server: distribute scenes over servers, since a query uses one scene; index the centres
-by a grid, so that a position prior selects few rows; and only then search approximately (inverted file with product
-quantization, the best 1,000 scored again with these rows), measured against this search.
+A large scene is in an index file, and only what has changed since is in memory. Its rows stand in lists of similar
+ones, of which a search reads the most similar; what it reads is compared in the same way (`Entries.similar`).
 """
 
-import sys
 import threading
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
@@ -25,8 +21,11 @@ from mapless.geometry import Array, RigidTransform
 from mapless_server.method.features.views import View
 from mapless_server.store import IndexedReference, SceneChanges
 
-Vector = NDArray[np.float32]
-"""(D,) of unit length, so that a dot product is a similarity, -1 to 1; zeros for a view without features."""
+from .index_file import IndexFile
+from .lists import likely_rows
+from .quantizing import Vector as Vector
+from .quantizing import products, quantized
+from .table import SMALLEST_CAPACITY, Table, grown, name_row
 
 
 class GlobalDescriptor(Protocol):
@@ -52,62 +51,71 @@ class GlobalDescriptor(Protocol):
 
 Rows = NDArray[np.intp]
 
-_CHUNK_BYTES = 1 << 20
-"""Bytes of float32 that are converted at a time, so that they fit a core's cache."""
-
-_LARGEST = 127
-_SMALLEST_CAPACITY = 64
-_GROWTH = 1.5
+CONSIDERED = 20_000
+"""Rows of an index file that a search compares, at least: the most similar lists that have so many."""
+CONSIDERED_SHARE = 0.02
+"""The same as a share of all rows of the file; see decision 041."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Table:
-    """One row per reference. Rows are appended after those that any Entries use, and not changed except as stated.
+class Similar:
+    """The references that a search has compared with a photograph.
 
     Attributes:
-        vectors: (capacity, D) int8. A row is written once, before its norm is set.
-        poses: (capacity, 3, 4), world_from_camera.
-        ids, keys: ids and keys of the references, one for each row.
-        row_of_key: row of each key.
-        row_of_id: newest row of each id.
+        rows: (N,), ascending; those that may be the most similar, or all.
+        similarity: (N,), NaN for references without a descriptor.
+        typical: median similarity of all references, known ones, to which the search was limited; inf without any. If
+            not all were compared, that of their lists.
     """
 
-    vectors: NDArray[np.int8]
-    poses: NDArray[np.float64]
-    ids: list[str]
-    keys: list[str]
-    row_of_key: dict[str, int]
-    row_of_id: dict[str, int]
-
-    @staticmethod
-    def empty(dimension: int, capacity: int) -> "_Table":
-        """Makes a table with room for this many rows."""
-        return _Table(np.empty((capacity, dimension), np.int8), np.empty((capacity, 3, 4)), [], [], {}, {})
-
-    def size_bytes(self) -> int:
-        """Size of the arrays and, estimated by the first ones, of the names, bytes."""
-        containers = sum(map(sys.getsizeof, (self.ids, self.keys, self.row_of_key, self.row_of_id)))
-        names = sum(map(sys.getsizeof, (*self.ids[:1], *self.keys[:1]))) + sys.getsizeof(1 << 20)
-        return self.vectors.nbytes + self.poses.nbytes + containers + names * len(self.ids)
+    rows: Rows
+    similarity: NDArray[np.float32]
+    typical: float
 
 
 @dataclass(frozen=True, eq=False)
 class Entries:
-    """The references of a scene at one generation; not changed by later updates."""
+    """The references of a scene at one generation; not changed by later updates.
+
+    The rows of the file, if there is one, are the first; those of the table follow.
+    """
 
     generation: int
-    _table: _Table
+    _table: Table
     _inverse_norms: NDArray[np.float32]
     """(n,): converts products with rows into similarities; 0 for a vector of zeros, NaN where there is none."""
     _alive: NDArray[np.bool_]
     """(n,): whether the row's reference has not been removed."""
     _count: int
+    file: IndexFile | None = None
 
     def __len__(self) -> int:
         return self._count
 
     def __contains__(self, reference_id: object) -> bool:
         return isinstance(reference_id, str) and self._find(reference_id) is not None
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether a search compares all references."""
+        return self.file is None
+
+    @property
+    def described_count(self) -> int:
+        """Number of references with a descriptor."""
+        return int(np.count_nonzero(self._alive & ~np.isnan(self._inverse_norms)))
+
+    def changed_counts(self) -> tuple[int, int]:
+        """Numbers of references with descriptors that are not in the file, and of those in it that were removed."""
+        first = self._first
+        new = np.count_nonzero(self._alive[first:] & ~np.isnan(self._inverse_norms[first:]))
+        gone = np.count_nonzero(~self._alive[:first] & ~np.isnan(self._inverse_norms[:first]))
+        return int(new), int(gone)
+
+    @property
+    def _first(self) -> int:
+        """First row of the table."""
+        return 0 if self.file is None else len(self.file)
 
     def rows(self, among: Collection[str] | None = None) -> Rows:
         """Rows (N,) of the references, ascending; only of these ids if given."""
@@ -118,65 +126,118 @@ class Entries:
 
     def rows_of_keys(self, keys: Collection[str]) -> dict[str, int]:
         """Rows of the references with these keys, as far as they are here, ascending."""
-        found = ((key, self._table.row_of_key.get(key, len(self._alive))) for key in keys)
-        here = ((key, row) for key, row in found if row < len(self._alive) and self._alive[row])
+        found = ((key, self._row_of_key(key)) for key in keys)
+        here = [(key, row) for key, row in found if row is not None and row < len(self._alive) and self._alive[row]]
         return dict(sorted(here, key=lambda it: it[1]))
 
     def similarities(self, vector: Vector, rows: Rows) -> NDArray[np.float32]:
-        """Similarity (N,) of a unit vector (D,) with rows; NaN for references without a descriptor."""
-        vectors = self._table.vectors
-        # If most rows are wanted, all are read in order; otherwise the wanted ones are gathered.
-        is_dense = len(rows) > len(self._alive) // 2
-        first, last = (0, len(self._alive)) if is_dense else (0, len(rows))
-        products = np.empty(last, np.float32)
-        step = max(1, _CHUNK_BYTES // (4 * vectors.shape[1]))
-        chunk = np.empty((step, vectors.shape[1]), np.float32)
-        for start in range(first, last, step):
-            stop = min(start + step, last)
-            part = chunk[: stop - start]
-            part[:] = vectors[start:stop] if is_dense else vectors[rows[start:stop]]
-            np.dot(part, vector, out=products[start:stop])
-        return (products[rows] if is_dense else products) * self._inverse_norms[rows]
+        """Similarity (N,) of a unit vector (D,) with rows, ascending; NaN for references without a descriptor."""
+        cut = int(np.searchsorted(rows, self._first))
+        found = self._table_products(vector, rows[cut:] - self._first)
+        if self.file is not None:
+            found = np.concatenate([self.file.products(vector, rows[:cut]), found])
+        return found * self._inverse_norms[rows]
+
+    def similar(self, vector: Vector | None, rows: Rows, count: int) -> Similar:
+        """Compares a unit vector (D,) with those of some rows, ascending, that may be the `count` most similar.
+
+        With all of them, unless more than `CONSIDERED` stand in a file. Without a vector nothing is similar.
+        """
+        if vector is None:
+            return Similar(rows, np.full(len(rows), np.nan, np.float32), np.inf)
+        considered = max(CONSIDERED, 10 * count, int(CONSIDERED_SHARE * self._first))
+        cut = int(np.searchsorted(rows, self._first))
+        if self.file is None or cut <= considered:
+            similarity = self.similarities(vector, rows)
+            known = similarity[~np.isnan(similarity)]
+            return Similar(rows, similarity, float(np.median(known)) if len(known) else np.inf)
+        likely, typical = likely_rows(rows[:cut], vector, self.file, considered)
+        chosen = np.concatenate([likely, rows[cut:]])
+        return Similar(chosen, self.similarities(vector, chosen), typical)
 
     def vector(self, row: int) -> Vector | None:
         """The descriptor (D,) of a row, rounded, of unit length; None if it has none."""
         inverse_norm = self._inverse_norms[row]
-        return None if np.isnan(inverse_norm) else self._table.vectors[row] * inverse_norm
+        if np.isnan(inverse_norm):
+            return None
+        in_table = row - self._first
+        steps = self._table.vectors[in_table] if self.file is None or in_table >= 0 else self.file.row(row)
+        return np.asarray(steps * inverse_norm, np.float32)
 
     def centres(self, rows: Rows) -> Array:
-        """Camera centres (N, 3), world, metres."""
-        return self._table.poses[rows, :, 3]
+        """Camera centres (N, 3), world, metres, of rows, ascending or not."""
+        return self._viewpoints(rows, 3, slice(0, 3))
 
     def axes(self, rows: Rows) -> Array:
         """Optical axes (N, 3), unit length, world."""
-        return self._table.poses[rows, :, 2]
+        return self._viewpoints(rows, 2, slice(3, 6))
 
     def reference(self, row: int) -> tuple[str, str, RigidTransform]:
         """Id, key and world_from_camera of a row."""
-        pose = self._table.poses[row].copy()
-        return self._table.ids[row], self._table.keys[row], RigidTransform(pose[:, :3], pose[:, 3])
+        in_table = row - self._first
+        if self.file is not None and in_table < 0:
+            return self.file.reference(row)
+        pose = self._table.poses[in_table].copy()
+        return self._table.ids[in_table], self._table.keys[in_table], RigidTransform(pose[:, :3], pose[:, 3])
 
     def undescribed(self) -> list[tuple[str, str]]:
         """Id and key of the references that have no descriptor."""
-        rows = np.flatnonzero(self._alive & np.isnan(self._inverse_norms)).tolist()
+        rows = (np.flatnonzero(self._alive & np.isnan(self._inverse_norms)) - self._first).tolist()
         return [(self._table.ids[row], self._table.keys[row]) for row in rows]
+
+    def _table_products(self, vector: Vector, rows: Rows) -> NDArray[np.float32]:
+        """Products (N,) of a vector with rows of the table."""
+        used = len(self._alive) - self._first
+        # If most rows are wanted, all are read in order; otherwise the wanted ones are gathered.
+        if len(rows) > used // 2:
+            return products(self._table.vectors[:used], vector)[rows]
+        return products(self._table.vectors, vector, rows)
+
+    def _viewpoints(self, rows: Rows, column: int, in_file: slice) -> Array:
+        in_table = rows - self._first
+        if self.file is None:
+            return self._table.poses[in_table, :, column]
+        found, is_filed = np.empty((len(rows), 3)), in_table < 0
+        found[is_filed] = self.file.viewpoints[rows[is_filed], in_file]
+        found[~is_filed] = self._table.poses[in_table[~is_filed], :, column]
+        return found
+
+    def _row_of_key(self, key: str) -> int | None:
+        """The newest row of a key, used or not."""
+        row = self._table.row_of_key.get(key)
+        if row is not None:
+            return row + self._first
+        return None if self.file is None else self.file.find_key(key)
 
     def _find(self, reference_id: str) -> int | None:
         row = self._table.row_of_id.get(reference_id)
-        if row is not None and row >= len(self._alive):  # it was replaced later: find the row of that time
-            before = (i for i in np.flatnonzero(self._alive).tolist() if self._table.ids[i] == reference_id)
-            row = next(before, None)
-        return row if row is not None and self._alive[row] else None
+        if row is not None and row + self._first >= len(
+            self._alive
+        ):  # it was replaced later: find the row of that time
+            alive = np.flatnonzero(self._alive[self._first :]).tolist()
+            row = next((i for i in alive if self._table.ids[i] == reference_id), None)
+        if row is not None and self._alive[row + self._first]:
+            return row + self._first
+        in_file = None if self.file is None else self.file.find_id(reference_id)
+        return in_file if in_file is not None and self._alive[in_file] else None
 
 
 class SceneIndex:
     """One scene in memory: updated by one thread at a time, read by any number without locks."""
 
-    def __init__(self, dimension: int) -> None:
-        """Makes an empty index of descriptors with `dimension` numbers."""
+    def __init__(self, dimension: int, file: IndexFile | None = None) -> None:
+        """Makes an index of descriptors with `dimension` numbers: empty, or as it is in a file.
+
+        IndexDamaged if the file is damaged.
+        """
         self._dimension = dimension
         self._lock = threading.Lock()
-        self._entries = self._empty(-1, 0)
+        self._entries = self._empty(-1, 0) if file is None else self._filed(file)
+
+    @property
+    def file(self) -> IndexFile | None:
+        """The file that is used; None if the scene is in memory."""
+        return self._entries.file
 
     @property
     def generation(self) -> int:
@@ -186,8 +247,9 @@ class SceneIndex:
     @property
     def size_bytes(self) -> int:
         """Memory of the index, bytes."""
-        entries = self._entries
-        return entries._table.size_bytes() + entries._inverse_norms.nbytes + entries._alive.nbytes
+        entries, file = self._entries, self._entries.file
+        of_file = 0 if file is None else file.memory_bytes
+        return of_file + entries._table.size_bytes() + entries._inverse_norms.nbytes + entries._alive.nbytes
 
     def entries(self) -> Entries:
         """Returns the scene as it is now."""
@@ -203,7 +265,7 @@ class SceneIndex:
                 self._check(reference.descriptor)
         with self._lock:
             before = self._empty(changes.generation, len(changes.added)) if changes.is_whole else self._entries
-            known = before._table.row_of_key
+            known = {it.key for it in changes.added if before._row_of_key(it.key) is not None}
             late = {it.key: it.descriptor for it in changes.added if it.key in known and it.descriptor is not None}
             new = list({it.key: it for it in changes.added if it.key not in known}.values())
             kept = _without(before, changes.removed)
@@ -224,30 +286,42 @@ class SceneIndex:
             raise ValueError(f"a descriptor has the shape {vector.shape}, the index holds ({self._dimension},)")
 
     def _empty(self, generation: int, capacity: int) -> Entries:
-        table = _Table.empty(self._dimension, max(capacity, _SMALLEST_CAPACITY))
+        table = Table.empty(self._dimension, max(capacity, SMALLEST_CAPACITY))
         return Entries(generation, table, np.empty(0, np.float32), np.empty(0, bool), 0)
+
+    def _filed(self, file: IndexFile) -> Entries:
+        """The references of a file; those without a descriptor are held in the table, which can be changed."""
+        count = len(file)
+        lacking = np.isnan(file.inverse_norms)
+        table = Table.empty(self._dimension, SMALLEST_CAPACITY)
+        described = Entries(
+            file.header.generation, table, file.inverse_norms, ~lacking, count - int(lacking.sum()), file
+        )
+        others = (file.reference(row) for row in np.flatnonzero(lacking).tolist())
+        added = [IndexedReference(*it, descriptor=None) for it in others]
+        return _with(described, added, file.header.generation)
 
 
 def _without(entries: Entries, keys: Collection[str]) -> Entries:
     """Returns the entries without some keys, copied to a new table if most rows have been removed."""
-    row_of_key = entries._table.row_of_key
-    rows = [row_of_key[key] for key in keys if key in row_of_key]
+    rows = [row for row in map(entries._row_of_key, keys) if row is not None]
     if not rows:
         return entries
     alive = entries._alive.copy()
     alive[rows] = False
     count = int(alive.sum())
     kept = replace(entries, _alive=alive, _count=count)
-    return _compacted(kept) if len(alive) > 2 * count + _SMALLEST_CAPACITY else kept
+    is_sparse = len(alive) > 2 * count + SMALLEST_CAPACITY
+    return _compacted(kept) if is_sparse and kept.is_exact else kept  # a file is made again
 
 
 def _compacted(entries: Entries) -> Entries:
     table, rows = entries._table, entries.rows()
     count = len(rows)
-    new = _Table.empty(table.vectors.shape[1], max(count, _SMALLEST_CAPACITY))
+    new = Table.empty(table.vectors.shape[1], max(count, SMALLEST_CAPACITY))
     new.vectors[:count], new.poses[:count] = table.vectors[rows], table.poses[rows]
     for i, row in enumerate(rows.tolist()):
-        _name(new, table.ids[row], table.keys[row], i)
+        name_row(new, table.ids[row], table.keys[row], i)
     return Entries(entries.generation, new, entries._inverse_norms[rows], np.ones(count, bool), count)
 
 
@@ -256,50 +330,30 @@ def _described(entries: Entries, vectors: Mapping[str, Vector]) -> Entries:
     norms = entries._inverse_norms.copy()
     for key, vector in vectors.items():
         row = entries._table.row_of_key.get(key)
-        if row is not None and np.isnan(norms[row]):
+        if row is not None and np.isnan(norms[row + entries._first]):
             # No reader uses the row: in all entries that have it, its norm is NaN.
-            entries._table.vectors[row], norms[row] = _quantized(vector)
+            entries._table.vectors[row], norms[row + entries._first] = _quantized(vector)
     return replace(entries, _inverse_norms=norms)
 
 
 def _with(entries: Entries, added: Collection[IndexedReference], generation: int) -> Entries:
     """Returns the entries with new ones added, at the next generation."""
-    first = len(entries._alive)
+    first, in_file = len(entries._alive), entries._first
     count = first + len(added)
-    table = _grown(entries._table, count)
+    table = grown(entries._table, count - in_file)
     norms = np.full(count, np.nan, np.float32)
     norms[:first] = entries._inverse_norms
-    for row, reference in enumerate(added, first):
+    for row, reference in enumerate(added, first - in_file):
         pose = reference.world_from_camera
         table.poses[row, :, :3], table.poses[row, :, 3] = pose.rotation, pose.translation
         if reference.descriptor is not None:
-            table.vectors[row], norms[row] = _quantized(reference.descriptor)
-        _name(table, reference.reference_id, reference.key, row)
+            table.vectors[row], norms[row + in_file] = _quantized(reference.descriptor)
+        name_row(table, reference.reference_id, reference.key, row)
     alive = np.ones(count, bool)
     alive[:first] = entries._alive
-    return Entries(generation, table, norms, alive, entries._count + len(added))
-
-
-def _grown(table: _Table, count: int) -> _Table:
-    """Returns the table with room for this many rows; names are shared, because they are only appended."""
-    capacity, dimension = table.vectors.shape
-    if count <= capacity:
-        return table
-    bigger = _Table.empty(dimension, max(count, int(_GROWTH * capacity)))
-    bigger.vectors[:capacity], bigger.poses[:capacity] = table.vectors, table.poses
-    return replace(table, vectors=bigger.vectors, poses=bigger.poses)
-
-
-def _name(table: _Table, reference_id: str, key: str, row: int) -> None:
-    table.ids.append(reference_id)
-    table.keys.append(key)
-    table.row_of_key[key] = table.row_of_id[reference_id] = row
+    return Entries(generation, table, norms, alive, entries._count + len(added), entries.file)
 
 
 def _quantized(vector: Vector) -> tuple[NDArray[np.int8], float]:
-    """Quantizes a vector to a 127th of its largest number; also returns the inverse of its norm, 0 for zeros."""
-    largest = float(np.abs(vector).max(initial=0.0))
-    if not largest > 0:
-        return np.zeros(vector.shape, np.int8), 0.0
-    steps = np.rint(vector * (_LARGEST / largest))
-    return steps.astype(np.int8), 1 / float(np.linalg.norm(steps))
+    rows, inverse_norms = quantized(vector[None])
+    return rows[0], float(inverse_norms[0])

@@ -129,21 +129,21 @@ def rank_references(entries: Entries, vector: Vector | None, selection: Selectio
         rows = rows[narrowing.keeps(entries.centres(rows), entries.axes(rows))]
     if not len(rows) or count < 1:
         return []
-    similarity = np.full(len(rows), np.nan, np.float32) if vector is None else entries.similarities(vector, rows)
-    score = _scores(similarity, entries, rows, narrowing)
-    known = similarity[~np.isnan(similarity)]
-    typical = float(np.median(known)) if len(known) else math.inf
     wanted, size = min(count, len(rows)), max(options.pool * count, options.smallest_pool)
+    similar = entries.similar(vector, rows, size)
     while True:
+        score = _scores(similar.similarity, entries, similar.rows, narrowing)
         pool = _best(score, size)
-        at = rows[pool]
-        order = spread(score[pool], entries.centres(at), entries.axes(at), wanted, typical, options)
+        at = similar.rows[pool]
+        order = spread(score[pool], entries.centres(at), entries.axes(at), wanted, similar.typical, options)
         if len(order) == wanted or len(pool) == len(rows):
             break
         size *= 10
+        if len(similar.rows) < len(rows):
+            similar = entries.similar(vector, rows, size)
     rest = np.setdiff1d(np.arange(len(pool)), order)  # in the order of their scores
     chosen = pool[[*order, *rest[: wanted - len(order)]]]
-    return [_ranked(entries, int(rows[i]), float(similarity[i])) for i in chosen]
+    return [_ranked(entries, int(similar.rows[i]), float(similar.similarity[i])) for i in chosen]
 
 
 def rank_among(
@@ -157,7 +157,7 @@ def rank_among(
     Returns:
         For each scene, its references, the most similar first.
     """
-    found = [_similar(entries, narrowing, vector) for entries, narrowing in scenes]
+    found = [_similar(entries, narrowing, vector, count) for entries, narrowing in scenes]
     everything = np.concatenate([np.empty(0, np.float32), *found])
     scene = np.repeat(np.arange(len(scenes)), [len(it) for it in found])
     best = _best(np.where(np.isnan(everything), -np.inf, everything), count)
@@ -173,12 +173,12 @@ def rank_among(
     return [*selected]
 
 
-def _similar(entries: Entries, narrowing: Narrowing, vector: Vector) -> NDArray[np.float32]:
-    """Similarities (N,) of the references within limits and likely values."""
+def _similar(entries: Entries, narrowing: Narrowing, vector: Vector, count: int) -> NDArray[np.float32]:
+    """Similarities (N,) of the references within limits and likely values that may be the `count` most similar."""
     rows = entries.rows()
     if not narrowing.is_empty:
         rows = rows[narrowing.keeps(entries.centres(rows), entries.axes(rows))]
-    return entries.similarities(vector, rows)
+    return entries.similar(vector, rows, count).similarity
 
 
 def rank_beside(entries: Entries, reference_id: str, count: int) -> list[RankedReference]:

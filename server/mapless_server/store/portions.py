@@ -1,0 +1,112 @@
+"""Reading a large scene for its index, in portions, so that it need not be in memory at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from sqlalchemy import Connection, Select, and_, select
+
+from mapless_server.security import SceneKey
+
+from . import rows, tables
+from .database import Database, unless_damaged
+from .queries import all_rows, find_scene
+from .records import IndexedReference
+
+
+@dataclass(frozen=True, eq=False)
+class IndexedPortion:
+    """Some references of a scene, in the order of their ids.
+
+    Attributes:
+        references: those that are intact.
+        damaged: ids of those whose pose or descriptor is damaged.
+        last_id: the last id, after which the next portion begins; empty if no reference follows.
+    """
+
+    references: tuple[IndexedReference, ...]
+    damaged: tuple[str, ...]
+    last_id: str
+
+
+@dataclass(frozen=True, eq=False)
+class IndexState:
+    """What an index of a scene is compared with, read at one moment.
+
+    Attributes:
+        create_time_us: when the scene was created, microseconds since 1970.
+        generation, reference_count: of the scene at that moment.
+        last_change: key of the reference that was added or deleted last until the wanted generation; empty if none is
+            known. Another history of the scene, as after its database was replaced by a backup, has another one.
+    """
+
+    create_time_us: int
+    generation: int
+    reference_count: int
+    last_change: str
+
+
+class IndexReader:
+    """Reads scenes for their indexes; each method sees one moment."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def read_portion(self, scene_key: SceneKey, after_id: str, count: int, descriptor_name: str) -> IndexedPortion:
+        """Reads at most `count` references with ids greater than `after_id`, with the descriptors of a name."""
+        with self._database.read() as connection:
+            return _read_portion(connection, scene_key, after_id, count, descriptor_name)
+
+    def read_state(self, scene_key: SceneKey, until_generation: int | None = None) -> IndexState:
+        """Reads the state; the last change is that until a generation, None for all. NotFound if there is no scene."""
+        with self._database.read() as connection:
+            return _read_state(connection, scene_key, until_generation)
+
+
+def _read_portion(
+    connection: Connection, scene_key: SceneKey, after_id: str, count: int, descriptor_name: str
+) -> IndexedPortion:
+    column, descriptor = tables.reference.c, tables.global_descriptor.c
+    chosen = select(column.reference_id, column.key).where(column.scene_id == scene_key, column.reference_id > after_id)
+    found = all_rows(connection, chosen.order_by(column.reference_id).limit(count))
+    if not found:
+        return IndexedPortion((), (), "")
+    indexed: Select[Any] = select(
+        column.reference_id, column.key, column.geometry, column.geometry_sha256, descriptor.data, descriptor.sha256
+    ).outerjoin(
+        tables.global_descriptor, and_(descriptor.reference_key == column.key, descriptor.name == descriptor_name)
+    )
+    of_scene = indexed.where(
+        column.scene_id == scene_key, column.reference_id > after_id, column.reference_id <= found[-1].reference_id
+    ).order_by(column.reference_id)
+
+    def read_each() -> list[Any]:
+        each = (partial(all_rows, connection, indexed.where(column.key == it.key)) for it in found)
+        return [row for one in each for row in unless_damaged(connection, one, lambda: ())]
+
+    read = unless_damaged(connection, lambda: list(all_rows(connection, of_scene)), read_each)
+    references, _ = rows.indexed_references(read, descriptor_name)
+    intact = {it.key for it in references}
+    damaged = tuple(it.reference_id for it in found if it.key not in intact)
+    return IndexedPortion(tuple(references), damaged, found[-1].reference_id)
+
+
+def _read_state(connection: Connection, scene_key: SceneKey, until_generation: int | None) -> IndexState:
+    scene = find_scene(connection, scene_key)
+    until = scene.generation if until_generation is None else until_generation
+    added, removed = tables.reference.c, tables.removed_reference.c
+    last_added = (
+        select(added.generation, added.key)
+        .where(added.scene_id == scene_key, added.generation <= until)
+        .order_by(added.generation.desc(), added.key)
+    )
+    last_removed = (
+        select(removed.generation, removed.reference_key)
+        .where(removed.scene_id == scene_key, removed.generation <= until)
+        .order_by(removed.generation.desc(), removed.reference_key)
+    )
+    last = (connection.execute(it.limit(1)).first() for it in (last_added, last_removed))
+    _, last_change = max((tuple(it) for it in last if it is not None), default=(0, ""))
+    return IndexState(scene.create_time_us, scene.generation, scene.reference_count, last_change)
