@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,8 @@ LIMITS: dict[str, dict[str, Any]] = {
     "both": {"scenes": ["hall"], "labels": SITE_A},
 }
 SCENES = {"attic": SITE_A, "barn": SITE_B, "hall": {}, "yard": SITE_A | {"floor": "1"}}
-LOCALIZE = "/mapless.v1.LocalizationService/Localize"
+LOCALIZATION_SERVICE = "/mapless.v1.LocalizationService/"
+LOCALIZE = LOCALIZATION_SERVICE + "Localize"
 VISIBLE = {
     "all": ["attic", "barn", "hall", "yard"],
     "named": ["hall"],
@@ -75,10 +77,13 @@ def variants_on(scene_id: str) -> list[tuple[str, Message]]:
     chosen.references.append(f"scenes/{scene_id}/references/r")
     foreign = localize_request(scene_id)
     foreign.references.append("scenes/hall/references/r")
-    several = localize_request(scene_id)
-    several.ClearField("scene")
-    several.scenes.extend(["scenes/hall", f"scenes/{scene_id}"])
-    return [*found, *((LOCALIZE, it) for it in (located, broken, chosen, foreign, several))]
+    several: list[tuple[str, Any]] = []
+    for method in ("Localize", "LocalizeProgressively", "LocalizeRig", "LocalizeSequence"):
+        request: Any = requests_on(scene_id)[LOCALIZATION_SERVICE + method]
+        request.ClearField("scene")
+        request.scenes.extend(["scenes/hall", f"scenes/{scene_id}"])
+        several.append((LOCALIZATION_SERVICE + method, request))
+    return [*found, *((LOCALIZE, it) for it in (located, broken, chosen, foreign)), *several]
 
 
 @pytest.mark.parametrize("index", range(len(variants_on("barn"))))
@@ -107,14 +112,15 @@ def test_scenes_within_the_limit_are_listed_and_answer(limited: Guarded, caller:
 
 
 def test_a_group_out_of_the_limit_is_as_one_that_is_absent(limited: Guarded) -> None:
-    def group(site: str) -> Message:
-        request = localize_request("hall")
+    def group(method: str, site: str) -> Message:
+        request: Any = requests_on("hall")[method]
         request.ClearField("scene")
         request.scene_group.labels["site"] = site
-        return request
+        return request  # type: ignore[no-any-return]
 
-    for caller in ("named", "site", "both"):
-        failures = [limited.failure(LOCALIZE, group(site), limited.tokens[caller]) for site in ("b", "z")]
+    for caller, name in product(("named", "site", "both"), ("Localize", "LocalizeRig", "LocalizeSequence")):
+        method = LOCALIZATION_SERVICE + name
+        failures = [limited.failure(method, group(method, site), limited.tokens[caller]) for site in ("b", "z")]
         assert said(failures[0], "site=b") == said(failures[1], "site=z")
         assert isinstance(failures[0], NotFound)
 
