@@ -131,19 +131,29 @@ class Room:
 
 def lit_room(seed: int, *added: Callable[[Room], None]) -> Room:
     """The furnished room, whose textures are the light that leaves them, with what is added to it last."""
-    room = Room(np.random.default_rng([seed, 0]))
+    room = furnished(Room(np.random.default_rng([seed, 0])), *added)
+    for quad in room.quads:
+        light_up(quad, room.boxes)
+    return room
+
+
+def furnished(room: Room, *added: Callable[[Room], None]) -> Room:
+    """The room with all that stands in it, and what is added to it last; its textures are colours without light."""
     for part in (shell, table, bookshelf, sideboard, corners, wall_pictures, *added):
         part(room)
-    for quad in room.quads:
-        light = np.asarray(cv2.pow(quad.levels[0], 2.2))
-        if quad.corner[0] > -1:  # the sky outside has light of its own
-            light *= np.asarray(cv2.resize(_irradiance(quad, room.boxes), light.shape[1::-1]), np.float32)
-        quad.levels[:] = [light.clip(0, 1)]
-        while max(quad.levels[-1].shape[:2]) > 4:
-            h, w = quad.levels[-1].shape[:2]
-            half = cv2.resize(quad.levels[-1], ((w + 1) // 2, (h + 1) // 2), interpolation=cv2.INTER_AREA)
-            quad.levels.append(np.asarray(half, np.float32))
     return room
+
+
+def light_up(quad: Quad, boxes: list[Box]) -> None:
+    """Makes the texture of a rectangle the light that leaves it, with its coarser levels."""
+    light = np.asarray(cv2.pow(quad.levels[0], 2.2))
+    if quad.corner[0] > -1:  # the sky outside has light of its own
+        light *= np.asarray(cv2.resize(_irradiance(quad, boxes), light.shape[1::-1]), np.float32)
+    quad.levels[:] = [light.clip(0, 1)]
+    while max(quad.levels[-1].shape[:2]) > 4:
+        h, w = quad.levels[-1].shape[:2]
+        half = cv2.resize(quad.levels[-1], ((w + 1) // 2, (h + 1) // 2), interpolation=cv2.INTER_AREA)
+        quad.levels.append(np.asarray(half, np.float32))
 
 
 def _irradiance(quad: Quad, boxes: list[Box]) -> Image:

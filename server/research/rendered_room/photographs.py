@@ -113,6 +113,8 @@ def shade(room: Room, camera: Camera, world_from_camera: RigidTransform) -> Floa
     order = np.argsort(nearest, axis=None, kind="stable")  # pixels of one rectangle together
     found, starts = np.unique(nearest.ravel()[order], return_index=True)
     for index, pixels in zip(found.tolist(), np.split(order, starts[1:]), strict=True):
+        if index < 0:  # beyond the sky outside the window
+            continue
         quad = room.quads[index]
         y, x = np.divmod(pixels, camera.width_px)
         matrix = uvw_from_pixel(quad, camera, world_from_camera)
