@@ -34,7 +34,7 @@ from mapless_server.scenes.plausibility import contradictions
 from mapless_server.security import Principal, SceneKey, key_of, scene_id_of, tenant_of
 from mapless_server.services import references as reference_service
 from mapless_server.services.messages.references import MAX_PAGE_SIZE
-from mapless_server.store import NewReference, ReferenceRecord, SceneAttributes, SceneRecord, codec, rows
+from mapless_server.store import NewReference, ReferenceRecord, Retirement, SceneAttributes, SceneRecord, codec, rows
 from mapless_server.store.depth_images import decode_depth_image, encode_depth_image
 
 from . import messages
@@ -179,7 +179,17 @@ class WatchfulStore:
         check_key(key)
         check_id(reference_id)
 
-    def list_references(self, key: SceneKey, limit: int, after: str) -> list[ReferenceRecord]:
+    def list_retirements(self, key: SceneKey, ids: Sequence[str]) -> dict[str, Retirement]:
+        check_key(key)
+        assert [check_id(it) for it in ids] == list(ids)
+        return {}
+
+    def restore_reference(self, key: SceneKey, reference_id: str) -> ReferenceRecord:
+        return self.get_reference(key, reference_id)
+
+    def list_references(
+        self, key: SceneKey, limit: int, after: str, *, only_adopted: bool = False, only_retired: bool = False
+    ) -> list[ReferenceRecord]:
         return [self.get_reference(key, it) for it in self.list_reference_ids(key, limit, after)]
 
     def list_reference_ids(self, key: SceneKey, limit: int, after: str) -> list[str]:
@@ -265,8 +275,10 @@ def seeds() -> tuple[bytes, ...]:
         variant=localization_pb.VARIANT_BEST,
         server_version="1",
     )
-    update = pb.UpdateSceneRequest(scene=pb.Scene(name=scene, datum=datum, down_in_world=down, calibration=calibration))
-    update.update_mask.paths.extend(["datum", "down_in_world", "calibration"])
+    policy = pb.AdoptionPolicy(most_per_place=2, min_trust=0.6, max_radius_m=0.1, min_surveyed_share=0.4)
+    known = pb.Scene(name=scene, datum=datum, down_in_world=down, calibration=calibration, adoption=policy)
+    update = pb.UpdateSceneRequest(scene=known)
+    update.update_mask.paths.extend(["datum", "down_in_world", "calibration", "adoption"])
     create = pb.CreateReferenceRequest(
         scene=scene, reference_id="r0", reference=pb.Reference(world_from_camera=pose, **photo)
     )
@@ -279,7 +291,7 @@ def seeds() -> tuple[bytes, ...]:
     retrieve.position_prior.position_m.x, retrieve.position_prior.radius_m = 1.0, 3.0
     retrieve.heading_prior.direction.x, retrieve.heading_prior.max_angle_deg = 1.0, 60.0
     made = (
-        pb.CreateSceneRequest(scene_id="hall", datum=datum, down_in_world=down, labels={"site": "a"}),
+        pb.CreateSceneRequest(scene_id="hall", datum=datum, down_in_world=down, labels={"site": "a"}, adoption=policy),
         pb.GetSceneRequest(name=scene),
         update,
         pb.ListScenesRequest(page_size=2, page_token=_token(pb.ListScenesRequest(page_size=2))),
@@ -292,6 +304,7 @@ def seeds() -> tuple[bytes, ...]:
             scene=scene, page_size=2, page_token=_token(pb.ListReferencesRequest(scene=scene, page_size=2))
         ),
         pb.DeleteReferenceRequest(name=reference),
+        pb.RestoreReferenceRequest(name=reference),
         retrieve,
         pb.AuditSceneRequest(
             scene=scene, page_size=2, page_token=_token(pb.AuditSceneRequest(scene=scene, page_size=2))

@@ -40,6 +40,13 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
     + [("max_matches", 0), ("position_factor", 0.0)],
     "scenes.retrieval.ranking.RankOptions": [("apart_m", -1.0), ("apart_deg", 181.0), ("nearby_weight", 1.5)]
     + [("nearby_weight", NAN), ("same_place_m", -1.0), ("per_place", 0), ("pool", 0), ("smallest_pool", 0)],
+    "scenes.adoption.policy.AdoptionOptions": [
+        ("min_matches", 0),
+        ("min_novelty", 1.5),
+        ("explained_share", 0.0),
+        ("same_viewpoint_deg", NAN),
+        ("interval_s", -1.0),
+    ],
     "scheduling.admission.WorkQueueOptions": [("max_queued_s", 0.0), ("max_bytes", -1)],
 }
 

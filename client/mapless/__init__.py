@@ -69,16 +69,17 @@ from .lenses import Fisheye, RadialTangential
 from .masks import IgnoredMask
 from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
-from .provenance import Provenance
+from .provenance import Provenance, Voucher
 from .requests import IntrinsicsUncertainty, NewReference, ReadoutDirection
 from .results import Coverage, PendingWork, Reference, ReferenceAudit, RetrievedReference, Scene
-from .scenes import UNCHANGED, Calibration
+from .scenes import UNCHANGED, AdoptionPolicy, Calibration
 from .shortcut import localize
 from .used_intrinsics import IntrinsicsCheck, UsedIntrinsics
 
 __all__ = [
     "UNCHANGED",
     "Accuracy",
+    "AdoptionPolicy",
     "AlreadyExists",
     "Attempt",
     "Calibration",
@@ -147,6 +148,7 @@ __all__ = [
     "Unauthenticated",
     "Unavailable",
     "UsedIntrinsics",
+    "Voucher",
     "aio",
     "localize",
     "read_camera",

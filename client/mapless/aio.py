@@ -13,7 +13,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, TypeVar
 
-from .calls import health, localization, references
+from .calls import adoption, health, localization, references
 from .connection import IN_FLIGHT, Connection, ItemT
 from .errors import MaplessError
 from .options import ConnectOptions
@@ -75,6 +75,8 @@ class Client(Connection):
     get_reference = references.get_reference
     list_references = references.list_references
     delete_reference = references.delete_reference
+    restore_reference = adoption.restore_reference
+    undo_adoption = adoption.undo_adoption
 
     retrieve_references = references.retrieve_references
     audit_scene = references.audit_scene

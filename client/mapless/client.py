@@ -10,7 +10,7 @@ from functools import wraps
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from .calls import health, localization, references
+from .calls import adoption, health, localization, references
 from .connection import IN_FLIGHT, Connection, ItemT
 from .errors import MaplessError
 from .options import ConnectOptions
@@ -111,6 +111,8 @@ class Client(Connection):
     get_reference = _blocking(references.get_reference)
     list_references = _iterated(references.list_references)
     delete_reference = _blocking(references.delete_reference)
+    restore_reference = _blocking(adoption.restore_reference)
+    undo_adoption = _blocking(adoption.undo_adoption)
 
     retrieve_references = _blocking(references.retrieve_references)
     audit_scene = _iterated(references.audit_scene)

@@ -22,7 +22,15 @@ from .geometry import Array, Camera, Quaternion, RigidTransform, Similarity
 from .groups import GroupRejected, ImageReport, RigLocalization, SequenceLocalization
 from .provenance import Provenance, provenance_from_message
 from .results import PendingWork, Reference, Scene
-from .scenes import Calibration, Vector, calibration_from_message, datum_from_message, direction_from_message
+from .scenes import (
+    AdoptionPolicy,
+    Calibration,
+    Vector,
+    adoption_from_message,
+    calibration_from_message,
+    datum_from_message,
+    direction_from_message,
+)
 from .used_intrinsics import UsedIntrinsics
 from .v1 import localization_service_pb2 as pb
 from .v1 import reference_service_pb2 as reference_pb
@@ -137,6 +145,7 @@ def _image_report(message: Any, path: str) -> ImageReport:
 
 _READERS: dict[Any, Callable[[Any, str], Any]] = {
     Accuracy: _accuracy,
+    AdoptionPolicy: adoption_from_message,
     Attempt: _attempt,
     Array: lambda covariance, path: np.array(covariance.row_major).reshape(6, 6),
     Calibration: calibration_from_message,

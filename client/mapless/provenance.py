@@ -4,16 +4,31 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from . import wire
+from . import names, wire
 from .answers import Accuracy
 from .v1 import reference_service_pb2 as pb
 from .wire import FieldError, joined
 
-GIVEN, PLACED, UNKNOWN = "GIVEN", "PLACED", "UNSPECIFIED"
+GIVEN, PLACED, ADOPTED, UNKNOWN = "GIVEN", "PLACED", "ADOPTED", "UNSPECIFIED"
 RADII = ("position_68_m", "position_95_m", "rotation_68_deg", "rotation_95_deg")
 LARGEST_M, LARGEST_DEG = 1000.0, 180.0
 """Largest radii of a position and of a rotation."""
+MOST_VOUCHERS = 64
+"""Surveyed references that vouch for an adopted one."""
 _SOURCE: wire.ProtoEnum = pb.PoseSource
+
+
+@dataclass(frozen=True)
+class Voucher:
+    """A surveyed reference that the pose of an adopted one rests on: its id, and its matches that agree with it."""
+
+    reference_id: str
+    match_count: int
+
+    def __post_init__(self) -> None:
+        names.check_id(self.reference_id)
+        if not 1 <= self.match_count < 2**31:
+            raise ValueError(f"match_count must be at least 1, is {self.match_count}")
 
 
 @dataclass(frozen=True)
@@ -21,18 +36,30 @@ class Provenance:
     """How the pose of a reference is known.
 
     Attributes:
-        source: "GIVEN" by the caller who stored it, or "PLACED" by mapless among the references that the scene had;
-            "UNSPECIFIED" where a server before 0.4 answers.
+        source: "GIVEN" by the caller who stored it, "PLACED" by mapless among the references that the scene had, or
+            "ADOPTED" from a localized photograph; "UNSPECIFIED" where a server before 0.4 answers.
         accuracy: errors of the pose against the poses of the scene's other references, at most 1000 m and 180 degrees;
-            None if unknown, which it is not for a reference that was placed.
+            None if unknown, which it is not for a reference that was placed or adopted.
+        surveyed_share: of an adopted one, the share of its photograph's matches that surveyed references supported,
+            above 0, at most 1; else 0.
+        vouchers: of an adopted one, the surveyed references that its pose rests on, at most 64; else empty.
     """
 
     source: str = GIVEN
     accuracy: Accuracy | None = None
+    surveyed_share: float = 0.0
+    vouchers: tuple[Voucher, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.source == PLACED and self.accuracy is None:
-            raise ValueError("accuracy is required where the pose was placed")
+        if self.source in (PLACED, ADOPTED) and self.accuracy is None:
+            raise ValueError(f"accuracy is required where the pose was {self.source.lower()}")
+        if self.source == ADOPTED:
+            if not 0 < self.surveyed_share <= 1:
+                raise ValueError(f"surveyed_share must be above 0, at most 1, is {self.surveyed_share:g}")
+            if not 1 <= len(self.vouchers) <= MOST_VOUCHERS:
+                raise ValueError(f"vouchers must be 1 to {MOST_VOUCHERS}, are {len(self.vouchers)}")
+        elif self.surveyed_share or self.vouchers:
+            raise ValueError("surveyed_share and vouchers are only of an adopted pose")
         if self.accuracy is None:
             return
         least = 0.0
@@ -55,7 +82,11 @@ def provenance_to_message(provenance: Provenance) -> pb.Provenance:
     TypeError for another type; ValueError if its source is unknown.
     """
     wire.require(provenance, Provenance, "provenance")
-    message = pb.Provenance(source=wire.enum_value(_SOURCE, "" if provenance.source == UNKNOWN else provenance.source))
+    message = pb.Provenance(
+        source=wire.enum_value(_SOURCE, "" if provenance.source == UNKNOWN else provenance.source),
+        surveyed_share=provenance.surveyed_share,
+        vouchers=[pb.Voucher(reference_id=it.reference_id, match_count=it.match_count) for it in provenance.vouchers],
+    )
     if provenance.accuracy is not None:
         wire.set_numbers(message.accuracy, {it: getattr(provenance.accuracy, it) for it in RADII}, "accuracy")
     return message
@@ -64,11 +95,16 @@ def provenance_to_message(provenance: Provenance) -> pb.Provenance:
 def provenance_from_message(message: pb.Provenance, field: str) -> Provenance:
     """Provenance of a message; an unknown source, from a newer program, is its number as text.
 
-    FieldError if a radius is out of range, or the accuracy of a placed pose is missing.
+    FieldError if a radius is out of range, or what a placed or adopted pose requires is missing.
     """
     accuracy = _radii([getattr(message.accuracy, it) for it in RADII]) if message.HasField("accuracy") else None
     try:
-        return Provenance(wire.value_name(_SOURCE.DESCRIPTOR, message.source), accuracy)
+        vouchers = tuple(Voucher(it.reference_id, it.match_count) for it in message.vouchers)
+    except ValueError as error:
+        raise FieldError(joined(field, "vouchers"), str(error)) from None
+    try:
+        source = wire.value_name(_SOURCE.DESCRIPTOR, message.source)
+        return Provenance(source, accuracy, message.surveyed_share, vouchers)
     except ValueError as error:
         name, _, fault = str(error).partition(" ")
         raise FieldError(joined(field, name), fault) from None
@@ -76,11 +112,15 @@ def provenance_from_message(message: pb.Provenance, field: str) -> Provenance:
 
 def provenance_to_json(provenance: Provenance) -> dict[str, Any] | None:
     """Provenance as JSON: `source` in small letters, and the radii; None for `GIVEN_POSE` or an unknown source."""
-    if provenance == GIVEN_POSE or provenance.source not in (GIVEN, PLACED):
+    if provenance == GIVEN_POSE or provenance.source not in (GIVEN, PLACED, ADOPTED):
         return None
     accuracy = provenance.accuracy
-    radii = {} if accuracy is None else {it: getattr(accuracy, it) for it in RADII}
-    return {"source": provenance.source.lower(), **radii}
+    content: dict[str, Any] = {"source": provenance.source.lower()}
+    content |= {} if accuracy is None else {it: getattr(accuracy, it) for it in RADII}
+    if provenance.source == ADOPTED:
+        content["surveyed_share"] = provenance.surveyed_share
+        content["vouchers"] = {it.reference_id: it.match_count for it in provenance.vouchers}
+    return content
 
 
 def provenance_from_json(content: object) -> Provenance:
@@ -89,19 +129,27 @@ def provenance_from_json(content: object) -> Provenance:
         return GIVEN_POSE
     if not isinstance(content, Mapping):
         raise ValueError("must be an object")
-    sources = [it.lower() for it in (GIVEN, PLACED)]
+    sources = [it.lower() for it in (GIVEN, PLACED, ADOPTED)]
     if content.get("source") not in sources:
-        raise ValueError(f"source must be {' or '.join(sources)}, is {content.get('source')!r}")
+        raise ValueError(f"source must be {', '.join(sources[:-1])} or {sources[-1]}, is {content.get('source')!r}")
     source = str(content["source"]).upper()
     if not any(it in content for it in RADII):
         return Provenance(source)
-    radii = []
-    for name in RADII:
-        radius = content.get(name)
-        if isinstance(radius, bool) or not isinstance(radius, int | float):
-            raise ValueError(f"{name} must be a number, is {radius!r}")
-        radii.append(float(radius))
-    return Provenance(source, _radii(radii))
+    accuracy = _radii([_number(content, it) for it in RADII])
+    if source != ADOPTED:
+        return Provenance(source, accuracy)
+    vouchers = content.get("vouchers")
+    if not isinstance(vouchers, Mapping) or not all(isinstance(it, int) for it in vouchers.values()):
+        raise ValueError("vouchers must be an object with numbers of matches")
+    vouching = tuple(Voucher(str(name), count) for name, count in vouchers.items())
+    return Provenance(source, accuracy, _number(content, "surveyed_share"), vouching)
+
+
+def _number(content: Mapping[Any, object], name: str) -> float:
+    value = content.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{name} must be a number, is {value!r}")
+    return float(value)
 
 
 def _radii(values: Sequence[float]) -> Accuracy:

@@ -8,7 +8,7 @@ from .depth import DepthImage
 from .geodesy import Datum
 from .geometry import Camera, RigidTransform
 from .provenance import GIVEN_POSE, Provenance
-from .scenes import Calibration, Vector
+from .scenes import AdoptionPolicy, Calibration, Vector
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,7 @@ class Scene:
         calibration: measured factors of radii; None if never measured.
         arbitrary_unit: whether lengths are in an arbitrary unit, as of a COLMAP model, instead of metres.
         labels: what groups it with other scenes, value by name.
+        adoption: which localized photographs become references; None if none do.
         warnings: contradictions of these properties and the references' poses, which `update_scene` found, or of the
             references' intrinsics or poses with one another, of which `get_scene` knows; else empty.
         contradiction: the sentence of the warnings that says that the scene contradicts itself, because its references
@@ -66,6 +67,7 @@ class Scene:
     calibration: Calibration | None = None
     arbitrary_unit: bool = False
     labels: Mapping[str, str] = field(default_factory=dict)
+    adoption: AdoptionPolicy | None = None
     warnings: tuple[str, ...] = ()
     contradiction: str = ""
     compared_pair_count: int = 0
@@ -92,6 +94,8 @@ class Reference:
             message, which `add_reference` and `add_references` found, and that the scene contradicts itself, as far as
             that was known; else empty.
         provenance: how its pose is known.
+        retire_time: when the server retired it, so that it is chosen no more; None if it is not retired.
+        retirement: why, one sentence for a person; empty if it is not retired.
     """
 
     scene_id: str
@@ -108,6 +112,8 @@ class Reference:
     provenance: Provenance = GIVEN_POSE
     depth: DepthImage | None = field(default=None, repr=False)
     depth_sha256: str = ""
+    retire_time: datetime | None = None
+    retirement: str = ""
 
 
 @dataclass(frozen=True, eq=False)

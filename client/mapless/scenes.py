@@ -1,7 +1,7 @@
 """Properties of a scene: calibration, directions, datum, and their messages, which client and server share."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 from enum import Enum
 from typing import Final, Literal
@@ -95,6 +95,40 @@ class Calibration:
         return measured == (features, backend, variant, server_version)
 
 
+MOST_PER_PLACE, LEAST_SURVEYED_SHARE = 100, 0.1
+"""Bounds of an adoption policy."""
+
+
+@dataclass(frozen=True)
+class AdoptionPolicy:
+    """Which localized photographs become references of a scene, of those whose requests allow it.
+
+    Attributes:
+        most_per_place: most adopted references at a place, which is what is nearer to one surveyed reference than to
+            any other, 1 to 100; the least useful go first.
+        min_trust: least trust of an answer, 0 to 1.
+        max_radius_m: largest 68 % radius of an answer's position, metres or the scene's arbitrary unit, above 0.
+        min_surveyed_share: least share of a photograph's matches that surveyed references support, 0.1 to 1. Where
+            photographs of a place have less, its adopted references are retired until there is a new survey.
+    """
+
+    most_per_place: int = 4
+    min_trust: float = 0.5
+    max_radius_m: float = 0.03
+    min_surveyed_share: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.most_per_place <= MOST_PER_PLACE:
+            raise ValueError(f"most_per_place must be 1 to {MOST_PER_PLACE}, is {self.most_per_place}")
+        if not 0 <= self.min_trust <= 1:
+            raise ValueError(f"min_trust must be 0 to 1, is {self.min_trust:g}")
+        if not 0 < self.max_radius_m < math.inf:
+            raise ValueError(f"max_radius_m must be above 0 and finite, is {self.max_radius_m:g}")
+        if not LEAST_SURVEYED_SHARE <= self.min_surveyed_share <= 1:
+            share = self.min_surveyed_share
+            raise ValueError(f"min_surveyed_share must be {LEAST_SURVEYED_SHARE:g} to 1, is {share:g}")
+
+
 def unit_vector(x: float, y: float, z: float) -> Vector:
     """The direction of a vector; ValueError if its length is 0 or not finite."""
     longest = max(abs(x), abs(y), abs(z))
@@ -161,6 +195,21 @@ def calibration_from_message(message: pb.SceneCalibration, field: str) -> Calibr
             variant=wire.value_name(_VARIANT.DESCRIPTOR, message.variant),
             create_time=message.create_time.ToDatetime(timezone.utc) if message.HasField("create_time") else None,
         )
+    except ValueError as error:
+        raise _of_field(error, field) from None
+
+
+def adoption_to_message(policy: AdoptionPolicy) -> pb.AdoptionPolicy:
+    """Message of an adoption policy; TypeError for another type."""
+    wire.require(policy, AdoptionPolicy, "adoption")
+    return pb.AdoptionPolicy(**vars(policy))
+
+
+def adoption_from_message(message: pb.AdoptionPolicy, field: str) -> AdoptionPolicy:
+    """Adoption policy of a message, whose zeros are defaults; FieldError if a number is out of range."""
+    given = {it.name: getattr(message, it.name) for it in fields(AdoptionPolicy)}
+    try:
+        return AdoptionPolicy(**{name: value for name, value in given.items() if value})
     except ValueError as error:
         raise _of_field(error, field) from None
 

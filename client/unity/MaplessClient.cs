@@ -100,6 +100,8 @@ namespace Mapless
             MethodOf(ReferenceService, "ListReferences", ListReferencesRequest.Parser, ListReferencesResponse.Parser);
         private static readonly Method<DeleteReferenceRequest, DeleteReferenceResponse> DeleteReferenceMethod =
             MethodOf(ReferenceService, "DeleteReference", DeleteReferenceRequest.Parser, DeleteReferenceResponse.Parser);
+        private static readonly Method<RestoreReferenceRequest, RestoreReferenceResponse> RestoreReferenceMethod =
+            MethodOf(ReferenceService, "RestoreReference", RestoreReferenceRequest.Parser, RestoreReferenceResponse.Parser);
         private static readonly Method<RetrieveReferencesRequest, RetrieveReferencesResponse> RetrieveReferencesMethod =
             MethodOf(ReferenceService, "RetrieveReferences", RetrieveReferencesRequest.Parser, RetrieveReferencesResponse.Parser);
         private static readonly Method<AuditSceneRequest, AuditSceneResponse> AuditSceneMethod =
@@ -450,6 +452,16 @@ namespace Mapless
             var request = new DeleteReferenceRequest { Name = reference };
             var gone = Gone(new DeleteReferenceResponse());
             return CallAsync(DeleteReferenceMethod, request, SceneOf(reference), timeout, cancellation, gone);
+        }
+
+        /// <summary>Has a retired reference chosen again.</summary>
+        public async Task<Reference> RestoreReferenceAsync(
+            string reference, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var request = new RestoreReferenceRequest { Name = reference };
+            var answer = await CallAsync(RestoreReferenceMethod, request, SceneOf(reference), timeout, cancellation)
+                .ConfigureAwait(true);
+            return answer.Reference;
         }
 
         /// <summary>The references that a photograph resembles.</summary>

@@ -70,6 +70,7 @@ GOOD: dict[str, Message] = {
     "GetReference": reference_pb.GetReferenceRequest(name=REFERENCE),
     "ListReferences": reference_pb.ListReferencesRequest(scene=SCENE),
     "DeleteReference": reference_pb.DeleteReferenceRequest(name=REFERENCE),
+    "RestoreReference": reference_pb.RestoreReferenceRequest(name=REFERENCE),
     "CreateScene": reference_pb.CreateSceneRequest(scene_id="s", datum=KNOWN.datum, down_in_world=KNOWN.down_in_world),
     "GetScene": reference_pb.GetSceneRequest(name=SCENE),
     "UpdateScene": reference_pb.UpdateSceneRequest(
@@ -218,6 +219,7 @@ BAD: dict[str, list[Case]] = {
         *(("page_token", token_of("acme", it)) for it in ("scenes/t", f"{SCENE} audit")),
     ],
     "DeleteReference": [("name", "scenes/../references/x")],
+    "RestoreReference": [("name", "scenes/../references/x")],
     "CreateScene": [
         ("scene_id", ".."),
         ("datum.latitude_deg", 91.0),

@@ -14,12 +14,13 @@ from sqlalchemy import Connection
 from support.stores import EXTRACTOR, Folder, Place, Shared, assert_same_view, faults_of, make_reference, view_of
 from support.waiting import wait_until
 
-from mapless import DepthImage
+from mapless import Accuracy, DepthImage, Provenance, Voucher
 from mapless_server import errors
 from mapless_server.method.features.matching import StoredPair
 from mapless_server.method.features.views import KeptDepth
 from mapless_server.security import DEFAULT_TENANT, SceneKey
-from mapless_server.store import Store, deletion, postgresql, reader
+from mapless_server.store import RetirementReason, Store, deletion, postgresql, reader
+from mapless_server.store.adoption import retire
 from mapless_server.store.backup import back_up, restore
 from mapless_server.store.calibrations import claim_scene
 from mapless_server.store.deletion import PendingDeletions
@@ -91,6 +92,9 @@ def test_all_that_refers_to_a_scene_goes_with_it(place: Place) -> None:
         keys = fill(store, OFFICE)
         store.add_references(OFFICE, [replace(make_reference("masked"), mask=b"mask", depth=DepthImage(b"", 1.0))])
         store.update_scene(OFFICE, labels={"site": "a"})
+        provenance = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("masked", 40),))
+        store.add_references(OFFICE, [replace(make_reference("adopted"), provenance=provenance)])
+        retire(store, OFFICE, keys[1:2], RetirementReason.CONTRADICTED)
         pairs, progress = PairStore(store.database), Progress()
         while claim := pairs.claim("nearest", progress):
             made = {(keys[0], claim.key): StoredPair(np.zeros((1, 2), np.int32))} if claim.key != keys[0] else {}

@@ -26,6 +26,7 @@ from mapless import (
     Provenance,
     RigidTransform,
     Scene,
+    Voucher,
 )
 from mapless.geodesy import enu_from_y_up
 from mapless.lenses import Fisheye, RadialTangential
@@ -74,13 +75,44 @@ def test_an_export_imports_as_the_same_scene(
         assert frame.image_path.name == reference.reference_id + ending
         assert frame.image_path.read_bytes() == reference.image
         assert (frame.mask_path and frame.mask_path.read_bytes()) == reference.mask
-        assert frame.provenance == (reference.provenance if layout == "cameras" else Provenance())
+        assert frame.provenance == (Provenance() if layout == "colmap" else reference.provenance)
         assert_same_camera(frame.camera, reference.camera, px=1e-12)
         assert_same_pose(frame.world_from_camera, reference.world_from_camera, 1e-12)
     # Its own importer agrees: there is nothing to add to the scene that it came from.
     again = run("import", tmp_path / "out", scene, "--skip-check", "--address", server.address)
     assert again.exit_code == 0, again.output
     assert "0 added, 3 skipped as duplicates, 0 refused" in again.stdout
+
+
+def export_of(
+    server: RunningServer, client: Client, filled: tuple[str, object], folder: Path, *flags: str
+) -> list[str]:
+    scene, _ = filled
+    vouchers = (Voucher("r.0-_A", 30), Voucher("r.2-_A", 20))
+    provenance = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.3, 0.4), 0.75, vouchers)
+    new = NewReference("kept", encode(".png", textured(seed=9)), CAMERA, truth().poses[2], provenance=provenance)
+    client.add_reference(scene, new)
+    done = run("export", scene, str(folder), *flags, "--address", server.address)
+    assert done.exit_code == 0, done.output
+    frames = read_dataset(folder).frames
+    assert all(it.provenance == provenance for it in frames if it.name == "kept")
+    return sorted(it.name for it in frames)
+
+
+@pytest.mark.parametrize("layout", ["cameras", "kapture"])
+def test_adopted_references_are_exported_apart(
+    server: RunningServer, client: Client, filled: tuple[str, object], tmp_path: Path, layout: str
+) -> None:
+    surveyed = ["r.0-_A", "r.1-_A", "r.2-_A"]
+    flags = "--format", layout, "--adopted"
+    assert export_of(server, client, filled, tmp_path / "all", *flags, "with") == ["kept", *surveyed]
+    client.delete_reference(filled[0], "kept")
+    assert export_of(server, client, filled, tmp_path / "survey", *flags, "without") == surveyed
+    client.delete_reference(filled[0], "kept")
+    assert export_of(server, client, filled, tmp_path / "only", *flags, "only") == ["kept"]
+    client.delete_reference(filled[0], "kept")
+    empty = run("export", filled[0], str(tmp_path / "none"), *flags, "only", "--address", server.address)
+    assert (empty.exit_code, "has no adopted references" in empty.output) == (2, True)
 
 
 @pytest.mark.parametrize("layout", ["cameras", "kapture"])

@@ -47,6 +47,7 @@ async def _localize_request(
     coverage: float = 0.0,
     ignore_calibration: bool = False,
     confidential: bool = False,
+    allow_adoption: bool = False,
     axes: Axes | str = "",
     include_debug: bool = False,
     include_imprecise_pose: bool = False,
@@ -86,6 +87,8 @@ async def _localize_request(
         coverage: share of right answers to accept, above 0 and below 1; 0 for the server's default.
         ignore_calibration: whether radii and trust are computed as if the scene had no calibration.
         confidential: whether the photograph is used for this answer only: neither captured nor shown to watchers.
+        allow_adoption: whether the photograph may be kept as a reference, if the scene adopts and it is not
+            confidential; it can then be read by all who may read the scene.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: the axes of `session_from_camera`
             and of `LocalizationResult.in_axes`.
         include_debug: whether the answer includes the matches that support it.
@@ -117,6 +120,7 @@ async def _localize_request(
             coverage=coverage,
             ignore_calibration=ignore_calibration,
             confidential=confidential,
+            allow_adoption=allow_adoption,
         ),
     )
     _set_scenes(request, scene, scenes, group, prior_scene)

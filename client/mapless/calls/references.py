@@ -21,7 +21,15 @@ from ..options import ConnectOptions
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, NewReference, create_request, read_image, read_mask
 from ..results import Coverage, Reference, ReferenceAudit, RetrievedReference, Scene
-from ..scenes import UNCHANGED, Calibration, UnchangedType, calibration_to_message, datum_to_message
+from ..scenes import (
+    UNCHANGED,
+    AdoptionPolicy,
+    Calibration,
+    UnchangedType,
+    adoption_to_message,
+    calibration_to_message,
+    datum_to_message,
+)
 from ..v1 import reference_service_pb2 as pb
 from . import repeats
 
@@ -36,6 +44,7 @@ async def create_scene(
     down_in_world: ArrayLike | None = None,
     arbitrary_unit: bool = False,
     labels: Mapping[str, str] | None = None,
+    adoption: AdoptionPolicy | None = None,
     timeout_s: float | None = None,
 ) -> Scene:
     """Creates a scene without references.
@@ -46,6 +55,7 @@ async def create_scene(
         down_in_world: (3,) direction of gravity, of any length; None for the direction that the datum gives, if any.
         arbitrary_unit: whether its references' poses are in an arbitrary unit instead of metres.
         labels: what groups it with other scenes, such as {"site": "a", "floor": "2"}.
+        adoption: which localized photographs become references; None for none.
         timeout_s: deadline of the call.
     """
     request = pb.CreateSceneRequest(
@@ -54,6 +64,7 @@ async def create_scene(
         down_in_world=None if down_in_world is None else wire.vector_to_message(down_in_world, "down_in_world"),
         arbitrary_unit=arbitrary_unit,
         labels=_labels(labels),
+        adoption=None if adoption is None else adoption_to_message(adoption),
     )
     on_repeat = partial(repeats.created_scene, request)
     return await connection.call("CreateScene", request, _scene, timeout_s, on_repeat=on_repeat)
@@ -88,6 +99,7 @@ async def update_scene(
     calibration: Calibration | UnchangedType | None = UNCHANGED,
     arbitrary_unit: bool | UnchangedType | None = UNCHANGED,
     labels: Mapping[str, str] | UnchangedType | None = UNCHANGED,
+    adoption: AdoptionPolicy | UnchangedType | None = UNCHANGED,
     timeout_s: float | None = None,
 ) -> Scene:
     """Changes properties of a scene. A property that is not given keeps its value; None deletes it.
@@ -99,6 +111,7 @@ async def update_scene(
         calibration: measured factors of the radii of answers.
         arbitrary_unit: whether the unit of length is arbitrary instead of the metre; None is False. No pose changes.
         labels: what groups it with other scenes, in place of all labels before.
+        adoption: which localized photographs become references; None for none from now on, and keeps those adopted.
         timeout_s: deadline of the call.
     """
     request = pb.UpdateSceneRequest(scene=pb.Scene(name=scene_name(scene)))
@@ -108,6 +121,7 @@ async def update_scene(
         "calibration": calibration,
         "arbitrary_unit": arbitrary_unit,
         "labels": labels,
+        "adoption": adoption,
     }
     request.update_mask.paths.extend(name for name, value in values.items() if value is not UNCHANGED)
     if datum is not None and datum is not UNCHANGED:
@@ -116,6 +130,8 @@ async def update_scene(
         request.scene.down_in_world.CopyFrom(wire.vector_to_message(down_in_world, "down_in_world"))
     if calibration is not None and calibration is not UNCHANGED:
         request.scene.calibration.CopyFrom(calibration_to_message(calibration))
+    if adoption is not None and adoption is not UNCHANGED:
+        request.scene.adoption.CopyFrom(adoption_to_message(adoption))
     request.scene.arbitrary_unit = arbitrary_unit is True
     if labels is not UNCHANGED:
         request.scene.labels.update(_labels(labels))
@@ -282,10 +298,18 @@ async def get_reference(
 
 
 async def list_references(
-    connection: Connection, scene: str, *, page_size: int = 0, timeout_s: float | None = None
+    connection: Connection,
+    scene: str,
+    *,
+    only_adopted: bool = False,
+    only_retired: bool = False,
+    page_size: int = 0,
+    timeout_s: float | None = None,
 ) -> AsyncIterator[Reference]:
-    """Lists a scene's references by id, without photographs, page by page; the deadline holds for each page."""
-    request = pb.ListReferencesRequest(scene=scene_name(scene), page_size=page_size)
+    """Lists a scene's references, or some, by id, without photographs; the deadline holds for each page."""
+    request = pb.ListReferencesRequest(
+        scene=scene_name(scene), page_size=page_size, only_adopted=only_adopted, only_retired=only_retired
+    )
     found = connection.listed(
         "ListReferences", request, lambda page: map(reference_from_message, page.references), timeout_s
     )

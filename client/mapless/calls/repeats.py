@@ -17,7 +17,7 @@ from ..messages import reference_from_message, scene_from_message
 from ..names import reference_name, scene_name
 from ..provenance import UNKNOWN, provenance_from_message
 from ..results import Reference, Scene
-from ..scenes import datum_from_message, direction_from_message
+from ..scenes import AdoptionPolicy, adoption_from_message, datum_from_message, direction_from_message
 from ..v1 import reference_service_pb2 as pb
 
 _SAME = 1e-9  # metres, degrees, entries of a rotation or direction: rounding errors of normalization
@@ -38,11 +38,16 @@ async def created_scene(wanted: pb.CreateSceneRequest, connection: Connection, e
         there = response.scene
         ours, theirs = _of_world(wanted), _of_world(there)
         is_alike = ours.shape == theirs.shape and np.allclose(ours, theirs, rtol=0, atol=_SAME)
-        if there.generation != 1 or not is_alike or dict(wanted.labels) != dict(there.labels):
+        is_alike = is_alike and dict(wanted.labels) == dict(there.labels) and _adoption(wanted) == _adoption(there)
+        if there.generation != 1 or not is_alike:
             raise error
         return scene_from_message(there)
 
     return await connection.call("GetScene", pb.GetSceneRequest(name=scene_name(wanted.scene_id)), read)
+
+
+def _adoption(message: Any) -> AdoptionPolicy | None:
+    return adoption_from_message(message.adoption, "adoption") if message.HasField("adoption") else None
 
 
 async def stored_reference(wanted: pb.CreateReferenceRequest, connection: Connection, error: MaplessError) -> Reference:

@@ -10,7 +10,7 @@ from mapless_command.installation import how_to_install
 
 from ..client import Client
 from ..shortcut import default_address
-from . import commands, doctor
+from . import adoption, commands, doctor
 from .parsing import COMMON_DEFAULTS, Command, Parser, add_common, all_parsers
 from .photographs import COUNT_DEFAULT, MASK, add_depth, add_limits, add_localize, count
 
@@ -58,7 +58,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     health.set_defaults(run=commands.health)
     _add_scene(groups.add_parser("scene", help="create, update, get, list, delete"))
-    _add_reference(groups.add_parser("reference", help="add, show, download, list, delete"))
+    _add_reference(groups.add_parser("reference", help="add, show, download, list, delete, restore"))
     add_localize(groups.add_parser("localize", help="localize a photograph, or a folder of them"))
     _add_questions(groups)
     completion = groups.add_parser(
@@ -101,16 +101,20 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
     create.add_argument("scene")
     _add_place(create)
     _add_labels(create, "what groups it with other scenes; may be repeated")
+    adoption.add_policy(create)
     create.set_defaults(run=commands.create_scene)
-    update = actions.add_parser("update", help="change its datum, direction of gravity, unit, labels or calibration")
+    update = actions.add_parser(
+        "update", help="change its datum, direction of gravity, unit, labels, adoption or calibration"
+    )
     update.add_argument("scene")
     _add_place(update)
     _add_labels(update, "label in place of all before; may be repeated")
+    adoption.add_policy(update)
     update.add_argument(
         "--forget",
         action="append",
         default=[],
-        choices=["datum", "down_in_world", "calibration", "labels"],
+        choices=["datum", "down_in_world", "calibration", "labels", "adoption"],
         help="property to delete; may be repeated",
     )
     update.set_defaults(run=commands.update_scene)
@@ -166,7 +170,11 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     add.set_defaults(run=commands.add_reference)
     listing = actions.add_parser("list", help="all references of a scene")
     listing.add_argument("scene")
+    some = listing.add_mutually_exclusive_group()
+    some.add_argument("--adopted", action="store_true", help="only adopted ones, with what vouches for them")
+    some.add_argument("--retired", action="store_true", help="only retired ones, with why")
     listing.set_defaults(run=commands.list_references)
+    adoption.add_actions(actions)
     for action, others, run, text in (
         ("show", ["get"], commands.show_reference, "its camera, pose, hash and number of features"),
         ("download", [], commands.download_reference, "its photograph, the bytes that were stored"),

@@ -15,9 +15,10 @@ from ..labels import parse_labels
 from ..lenses import lens_model_of
 from ..names import check_id
 from ..pixels import format_of_image
-from ..provenance import GIVEN, PLACED, Provenance
+from ..provenance import ADOPTED, GIVEN, PLACED, Provenance
 from ..requests import NewReference
 from ..results import Reference, Scene, summary_of
+from .adoption import adopted_table, policy_of, policy_text, retired_table
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import depth_of, limits
 from .output import card, is_confirmed, plain, serving_states, show, table
@@ -43,6 +44,7 @@ def create_scene(client: Client, arguments: argparse.Namespace) -> int:
         down_in_world=down,
         arbitrary_unit=is_arbitrary,
         labels=parse_labels(arguments.label),
+        adoption=policy_of(arguments),
     )
     return show(arguments, scene, _scene_card(scene))
 
@@ -58,10 +60,12 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
         changes["arbitrary_unit"] = arguments.unit == "arbitrary"
     if arguments.label:
         changes["labels"] = parse_labels(arguments.label)
+    if (policy := policy_of(arguments)) is not None:
+        changes["adoption"] = policy
     if both := [it for it in arguments.forget if changes[it] is not None]:
         raise ValueError(f"{both[0]} is given, and to be forgotten")
     if not changes:
-        raise ValueError("nothing to change: give --datum, --down, --unit, --label or --forget")
+        raise ValueError("nothing to change: give --datum, --down, --unit, --label, --adopt or --forget")
     scene = client.update_scene(arguments.scene, **changes)
     _warn(scene.warnings)
     return show(arguments, scene, _scene_card(scene))
@@ -99,6 +103,7 @@ def _scene_card(scene: Scene) -> list[str]:
         datum=f"{_place(scene.datum)}, {scene.datum.height_m:.2f} m" if scene.datum else None,
         down=None if down is None else " ".join(f"{it:.4f}" for it in down),
         labels=_labels(scene) or None,
+        adopts=policy_text(scene.adoption),
         calibration=f"measured with {calibration.query_count} photographs" if calibration else None,
         created=_minute(scene),
         background=f"still makes {summary_of(scene.pending_work)}" if scene.pending_work else None,
@@ -169,7 +174,11 @@ def list_references(client: Client, arguments: argparse.Namespace) -> int:
     """Lists the references of a scene."""
     if client.get_scene(arguments.scene).arbitrary_unit:
         print("mapless: note: the scene's unit of length is arbitrary, not the metre", file=sys.stderr)
-    references = list(client.list_references(arguments.scene))
+    wanted = {"only_adopted": arguments.adopted, "only_retired": arguments.retired}
+    references = list(client.list_references(arguments.scene, **wanted))
+    if arguments.adopted or arguments.retired:
+        text = adopted_table(references) if arguments.adopted else retired_table(references)
+        return show(arguments, references, text)
     rows = [
         (it.reference_id, _size(it), *_position(it.world_from_camera), it.feature_count, _minute(it))
         for it in references
@@ -198,6 +207,7 @@ def _reference_card(it: Reference) -> list[str]:
         position=" ".join(_position(it.world_from_camera)),
         rotation=f"x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}",
         pose=_pose_of(it.provenance),
+        retired=it.retirement or None,
         depth=_depth_of(it),
         features=it.feature_count,
         sha256=it.image_sha256,
@@ -217,7 +227,8 @@ def _depth_of(it: Reference) -> str | None:
 
 def _pose_of(provenance: Provenance) -> str:
     accuracy = provenance.accuracy
-    source = {PLACED: "placed by mapless", GIVEN: "given"}.get(provenance.source, "unknown")
+    known = {PLACED: "placed by mapless", GIVEN: "given", ADOPTED: "adopted from a localized photograph"}
+    source = known.get(provenance.source, "unknown")
     return source if accuracy is None else f"{source}, within {accuracy.position_95_m:.3g} (95 %)"
 
 

@@ -237,6 +237,7 @@ def _answers(
         "rerank_references": arguments.rerank,
         "coverage": arguments.coverage,
         "axes": arguments.axes,
+        "allow_adoption": arguments.allow_adoption,
         "include_imprecise_pose": arguments.include_imprecise_pose,
         "include_debug": arguments.debug,
     }

@@ -70,6 +70,9 @@ def add_localize(command: Command) -> None:
         help="with a rejection for the radius of the position alone, print the pose too, with its radii",
     )  # fmt: skip
     command.add_argument(
+        "--allow-adoption", action="store_true", help="the photographs may be kept as references, if the scene adopts"
+    )
+    command.add_argument(
         "--progressive", action="store_true", help="print each better answer as soon as there is one, then the last"
     )
     command.add_argument("--parallel", type=int, default=2, help="concurrent calls for a folder (default: %(default)s)")

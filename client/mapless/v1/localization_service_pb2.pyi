@@ -350,7 +350,7 @@ class PosePrior(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ...) -> None: ...
 
 class LocalizeOptions(_message.Message):
-    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage", "ignore_calibration", "confidential", "include_imprecise_pose")
+    __slots__ = ("variant", "scale_strategy", "reference_count", "allow_coarse", "rerank_references", "axes", "include_debug", "coverage", "ignore_calibration", "confidential", "include_imprecise_pose", "allow_adoption")
     VARIANT_FIELD_NUMBER: _ClassVar[int]
     SCALE_STRATEGY_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -362,6 +362,7 @@ class LocalizeOptions(_message.Message):
     IGNORE_CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     CONFIDENTIAL_FIELD_NUMBER: _ClassVar[int]
     INCLUDE_IMPRECISE_POSE_FIELD_NUMBER: _ClassVar[int]
+    ALLOW_ADOPTION_FIELD_NUMBER: _ClassVar[int]
     variant: Variant
     scale_strategy: ScaleStrategy
     reference_count: int
@@ -373,7 +374,8 @@ class LocalizeOptions(_message.Message):
     ignore_calibration: bool
     confidential: bool
     include_imprecise_pose: bool
-    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ..., ignore_calibration: bool = ..., confidential: bool = ..., include_imprecise_pose: bool = ...) -> None: ...
+    allow_adoption: bool
+    def __init__(self, variant: _Optional[_Union[Variant, str]] = ..., scale_strategy: _Optional[_Union[ScaleStrategy, str]] = ..., reference_count: _Optional[int] = ..., allow_coarse: bool = ..., rerank_references: bool = ..., axes: _Optional[_Union[Axes, str]] = ..., include_debug: bool = ..., coverage: _Optional[float] = ..., ignore_calibration: bool = ..., confidential: bool = ..., include_imprecise_pose: bool = ..., allow_adoption: bool = ...) -> None: ...
 
 class LocalizeResponse(_message.Message):
     __slots__ = ("localization", "rejection", "diagnostics", "capture_time", "session_from_camera", "debug", "scene")

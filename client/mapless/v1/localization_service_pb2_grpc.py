@@ -109,7 +109,8 @@ class LocalizationServiceServicer(object):
     def Localize(self, request, context):
         """Localizes one photograph. Safe to retry. Stores nothing, unless the server's operator has it capture calls of this and
         the next three methods: then `Diagnostics.captured` is true, and the server keeps its photographs for a time. It
-        never captures a call with LocalizeOptions.confidential.
+        never captures a call with LocalizeOptions.confidential. A scene may adopt photographs whose calls allow it
+        (LocalizeOptions.allow_adoption).
 
         "I could not localize this" is an answer (Rejection), not an error. Errors:
 

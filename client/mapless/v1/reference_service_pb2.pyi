@@ -15,6 +15,7 @@ class PoseSource(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     POSE_SOURCE_UNSPECIFIED: _ClassVar[PoseSource]
     POSE_SOURCE_GIVEN: _ClassVar[PoseSource]
     POSE_SOURCE_PLACED: _ClassVar[PoseSource]
+    POSE_SOURCE_ADOPTED: _ClassVar[PoseSource]
 
 class AuditVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -29,6 +30,7 @@ class AuditVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     AUDIT_VERDICT_UNVERIFIABLE: _ClassVar[AuditVerdict]
     AUDIT_VERDICT_WRONG_DEPTH: _ClassVar[AuditVerdict]
     AUDIT_VERDICT_DOUBTFUL_DEPTH: _ClassVar[AuditVerdict]
+    AUDIT_VERDICT_RETIRED: _ClassVar[AuditVerdict]
 
 class CoverageVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -39,6 +41,7 @@ class CoverageVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
 POSE_SOURCE_UNSPECIFIED: PoseSource
 POSE_SOURCE_GIVEN: PoseSource
 POSE_SOURCE_PLACED: PoseSource
+POSE_SOURCE_ADOPTED: PoseSource
 AUDIT_VERDICT_UNSPECIFIED: AuditVerdict
 AUDIT_VERDICT_CONSISTENT: AuditVerdict
 AUDIT_VERDICT_WRONG_POSE: AuditVerdict
@@ -50,13 +53,14 @@ AUDIT_VERDICT_SCENE_CHANGED: AuditVerdict
 AUDIT_VERDICT_UNVERIFIABLE: AuditVerdict
 AUDIT_VERDICT_WRONG_DEPTH: AuditVerdict
 AUDIT_VERDICT_DOUBTFUL_DEPTH: AuditVerdict
+AUDIT_VERDICT_RETIRED: AuditVerdict
 COVERAGE_VERDICT_UNSPECIFIED: CoverageVerdict
 COVERAGE_VERDICT_LOCALIZABLE: CoverageVerdict
 COVERAGE_VERDICT_DOUBTFUL: CoverageVerdict
 COVERAGE_VERDICT_NOT_LOCALIZABLE: CoverageVerdict
 
 class Scene(_message.Message):
-    __slots__ = ("name", "generation", "reference_count", "create_time", "datum", "down_in_world", "calibration", "arbitrary_unit", "labels")
+    __slots__ = ("name", "generation", "reference_count", "create_time", "datum", "down_in_world", "calibration", "arbitrary_unit", "labels", "adoption")
     class LabelsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -73,6 +77,7 @@ class Scene(_message.Message):
     CALIBRATION_FIELD_NUMBER: _ClassVar[int]
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     LABELS_FIELD_NUMBER: _ClassVar[int]
+    ADOPTION_FIELD_NUMBER: _ClassVar[int]
     name: str
     generation: int
     reference_count: int
@@ -82,7 +87,20 @@ class Scene(_message.Message):
     calibration: SceneCalibration
     arbitrary_unit: bool
     labels: _containers.ScalarMap[str, str]
-    def __init__(self, name: _Optional[str] = ..., generation: _Optional[int] = ..., reference_count: _Optional[int] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., calibration: _Optional[_Union[SceneCalibration, _Mapping]] = ..., arbitrary_unit: bool = ..., labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    adoption: AdoptionPolicy
+    def __init__(self, name: _Optional[str] = ..., generation: _Optional[int] = ..., reference_count: _Optional[int] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., calibration: _Optional[_Union[SceneCalibration, _Mapping]] = ..., arbitrary_unit: bool = ..., labels: _Optional[_Mapping[str, str]] = ..., adoption: _Optional[_Union[AdoptionPolicy, _Mapping]] = ...) -> None: ...
+
+class AdoptionPolicy(_message.Message):
+    __slots__ = ("most_per_place", "min_trust", "max_radius_m", "min_surveyed_share")
+    MOST_PER_PLACE_FIELD_NUMBER: _ClassVar[int]
+    MIN_TRUST_FIELD_NUMBER: _ClassVar[int]
+    MAX_RADIUS_M_FIELD_NUMBER: _ClassVar[int]
+    MIN_SURVEYED_SHARE_FIELD_NUMBER: _ClassVar[int]
+    most_per_place: int
+    min_trust: float
+    max_radius_m: float
+    min_surveyed_share: float
+    def __init__(self, most_per_place: _Optional[int] = ..., min_trust: _Optional[float] = ..., max_radius_m: _Optional[float] = ..., min_surveyed_share: _Optional[float] = ...) -> None: ...
 
 class Datum(_message.Message):
     __slots__ = ("latitude_deg", "longitude_deg", "height_m", "enu_from_world")
@@ -127,7 +145,7 @@ class SceneCalibration(_message.Message):
     def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., reference_noise_m: _Optional[float] = ..., reference_noise_deg: _Optional[float] = ..., grows_with_gap: bool = ...) -> None: ...
 
 class Reference(_message.Message):
-    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance", "depth", "depth_sha256")
+    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance", "depth", "depth_sha256", "retire_time", "retirement")
     NAME_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
@@ -140,6 +158,8 @@ class Reference(_message.Message):
     PROVENANCE_FIELD_NUMBER: _ClassVar[int]
     DEPTH_FIELD_NUMBER: _ClassVar[int]
     DEPTH_SHA256_FIELD_NUMBER: _ClassVar[int]
+    RETIRE_TIME_FIELD_NUMBER: _ClassVar[int]
+    RETIREMENT_FIELD_NUMBER: _ClassVar[int]
     name: str
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
@@ -152,18 +172,32 @@ class Reference(_message.Message):
     provenance: Provenance
     depth: _geometry_pb2.DepthImage
     depth_sha256: str
-    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., depth_sha256: _Optional[str] = ...) -> None: ...
+    retire_time: _timestamp_pb2.Timestamp
+    retirement: str
+    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., depth_sha256: _Optional[str] = ..., retire_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., retirement: _Optional[str] = ...) -> None: ...
 
 class Provenance(_message.Message):
-    __slots__ = ("source", "accuracy")
+    __slots__ = ("source", "accuracy", "surveyed_share", "vouchers")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
+    SURVEYED_SHARE_FIELD_NUMBER: _ClassVar[int]
+    VOUCHERS_FIELD_NUMBER: _ClassVar[int]
     source: PoseSource
     accuracy: _localization_service_pb2.Accuracy
-    def __init__(self, source: _Optional[_Union[PoseSource, str]] = ..., accuracy: _Optional[_Union[_localization_service_pb2.Accuracy, _Mapping]] = ...) -> None: ...
+    surveyed_share: float
+    vouchers: _containers.RepeatedCompositeFieldContainer[Voucher]
+    def __init__(self, source: _Optional[_Union[PoseSource, str]] = ..., accuracy: _Optional[_Union[_localization_service_pb2.Accuracy, _Mapping]] = ..., surveyed_share: _Optional[float] = ..., vouchers: _Optional[_Iterable[_Union[Voucher, _Mapping]]] = ...) -> None: ...
+
+class Voucher(_message.Message):
+    __slots__ = ("reference_id", "match_count")
+    REFERENCE_ID_FIELD_NUMBER: _ClassVar[int]
+    MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    reference_id: str
+    match_count: int
+    def __init__(self, reference_id: _Optional[str] = ..., match_count: _Optional[int] = ...) -> None: ...
 
 class CreateSceneRequest(_message.Message):
-    __slots__ = ("scene_id", "datum", "down_in_world", "arbitrary_unit", "labels")
+    __slots__ = ("scene_id", "datum", "down_in_world", "arbitrary_unit", "labels", "adoption")
     class LabelsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -176,12 +210,14 @@ class CreateSceneRequest(_message.Message):
     DOWN_IN_WORLD_FIELD_NUMBER: _ClassVar[int]
     ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
     LABELS_FIELD_NUMBER: _ClassVar[int]
+    ADOPTION_FIELD_NUMBER: _ClassVar[int]
     scene_id: str
     datum: Datum
     down_in_world: _geometry_pb2.Vector3
     arbitrary_unit: bool
     labels: _containers.ScalarMap[str, str]
-    def __init__(self, scene_id: _Optional[str] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., arbitrary_unit: bool = ..., labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    adoption: AdoptionPolicy
+    def __init__(self, scene_id: _Optional[str] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., arbitrary_unit: bool = ..., labels: _Optional[_Mapping[str, str]] = ..., adoption: _Optional[_Union[AdoptionPolicy, _Mapping]] = ...) -> None: ...
 
 class CreateSceneResponse(_message.Message):
     __slots__ = ("scene",)
@@ -321,14 +357,18 @@ class GetReferenceResponse(_message.Message):
     def __init__(self, reference: _Optional[_Union[Reference, _Mapping]] = ...) -> None: ...
 
 class ListReferencesRequest(_message.Message):
-    __slots__ = ("scene", "page_size", "page_token")
+    __slots__ = ("scene", "page_size", "page_token", "only_adopted", "only_retired")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     PAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
     PAGE_TOKEN_FIELD_NUMBER: _ClassVar[int]
+    ONLY_ADOPTED_FIELD_NUMBER: _ClassVar[int]
+    ONLY_RETIRED_FIELD_NUMBER: _ClassVar[int]
     scene: str
     page_size: int
     page_token: str
-    def __init__(self, scene: _Optional[str] = ..., page_size: _Optional[int] = ..., page_token: _Optional[str] = ...) -> None: ...
+    only_adopted: bool
+    only_retired: bool
+    def __init__(self, scene: _Optional[str] = ..., page_size: _Optional[int] = ..., page_token: _Optional[str] = ..., only_adopted: bool = ..., only_retired: bool = ...) -> None: ...
 
 class ListReferencesResponse(_message.Message):
     __slots__ = ("references", "next_page_token")
@@ -347,6 +387,18 @@ class DeleteReferenceRequest(_message.Message):
 class DeleteReferenceResponse(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
+
+class RestoreReferenceRequest(_message.Message):
+    __slots__ = ("name",)
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    def __init__(self, name: _Optional[str] = ...) -> None: ...
+
+class RestoreReferenceResponse(_message.Message):
+    __slots__ = ("reference",)
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    reference: Reference
+    def __init__(self, reference: _Optional[_Union[Reference, _Mapping]] = ...) -> None: ...
 
 class RetrieveReferencesRequest(_message.Message):
     __slots__ = ("scene", "image", "intrinsics", "count", "position_prior", "heading_prior", "mask")

@@ -106,6 +106,11 @@ class ReferenceServiceStub(object):
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceRequest.SerializeToString,
                 response_deserializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceResponse.FromString,
                 _registered_method=True)
+        self.RestoreReference = channel.unary_unary(
+                '/mapless.v1.ReferenceService/RestoreReference',
+                request_serializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceResponse.FromString,
+                _registered_method=True)
         self.RetrieveReferences = channel.unary_unary(
                 '/mapless.v1.ReferenceService/RetrieveReferences',
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.RetrieveReferencesRequest.SerializeToString,
@@ -220,6 +225,14 @@ class ReferenceServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def RestoreReference(self, request, context):
+        """Has a retired reference chosen again (Reference.retire_time), and forgets what was held against it. One that is not
+        retired is left as it is.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def RetrieveReferences(self, request, context):
         """Finds the references that resemble a photograph most. Localize, when it is given none, takes twice as many as it uses
         in this way, and of these the ones with the most feature matches. Takes the role localize. A scene without references
@@ -296,6 +309,11 @@ def add_ReferenceServiceServicer_to_server(servicer, server):
                     servicer.DeleteReference,
                     request_deserializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceRequest.FromString,
                     response_serializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceResponse.SerializeToString,
+            ),
+            'RestoreReference': grpc.unary_unary_rpc_method_handler(
+                    servicer.RestoreReference,
+                    request_deserializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceResponse.SerializeToString,
             ),
             'RetrieveReferences': grpc.unary_unary_rpc_method_handler(
                     servicer.RetrieveReferences,
@@ -605,6 +623,33 @@ class ReferenceService(object):
             '/mapless.v1.ReferenceService/DeleteReference',
             mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceRequest.SerializeToString,
             mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RestoreReference(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.ReferenceService/RestoreReference',
+            mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceRequest.SerializeToString,
+            mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceResponse.FromString,
             options,
             channel_credentials,
             insecure,

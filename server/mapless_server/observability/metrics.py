@@ -64,6 +64,20 @@ COUNTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "calibrations": ("Scenes that were calibrated from their references.", *_ALONE),
     "calibration_cpu_seconds": ("Processor time of that, counted as the background matching's.", *_ALONE),
     "calibration_failures": ("Failures of calibrating a scene from its references; each is tried again.", *_ALONE),
+    "adoptions": (
+        "Localized photographs that their callers allow to become references, where scenes adopt.",
+        "result",
+        (
+            *("adopted", "uncertain", "unsupported", "little_surveyed", "disagrees", "elsewhere", "nothing_new"),
+            *("place_full", "changed", "queue", "failed"),
+        ),
+    ),
+    "retirements": (
+        "References that were retired, so that they are not chosen any more.",
+        "reason",
+        ("contradicted", "survey_outdated", "vouchers_gone"),
+    ),
+    "adopted_expired": ("Adopted references that were deleted because of their age.", *_ALONE),
     "fatal": ("Faults that end the process.", *_ALONE),
     "captured": ("Calls that were captured.", *_ALONE),
     "capture_dropped": (

@@ -193,6 +193,7 @@ METHOD_ROLES: Mapping[str, Role] = {
     "/mapless.v1.ReferenceService/GetReference": Role.READ,
     "/mapless.v1.ReferenceService/ListReferences": Role.READ,
     "/mapless.v1.ReferenceService/DeleteReference": Role.WRITE,
+    "/mapless.v1.ReferenceService/RestoreReference": Role.WRITE,
     "/mapless.v1.ReferenceService/RetrieveReferences": Role.LOCALIZE,
     "/mapless.v1.ReferenceService/AuditScene": Role.WRITE,
     "/mapless.v1.ReferenceService/CheckCoverage": Role.LOCALIZE,

@@ -262,7 +262,11 @@ async def _start(
     _run_task(stack, stop_serving())
     services.starts("it localizes its first photograph")
     await _warm_up(settings, engine, metrics)
-    await services.open(engine)
+    from .adoption.adopter import Adopter  # what it imports is loaded by now
+
+    adopter = Adopter(engine, store, metrics, settings.capture_hours)
+    await services.open(engine, adopter.offer)
+    _run_task(stack, adopter.run())
     from .idle import release_when_idle  # what it imports is loaded by now
 
     _run_task(stack, release_when_idle(engine.tiers, QUIET_S))

@@ -26,7 +26,7 @@ from mapless_server.settings import Settings
 from mapless_server.store import Store
 
 from .capture.recorder import Recorder
-from .localization import LocalizationService
+from .localization import LocalizationService, Offer
 from .references import ReferenceService
 from .watching import Watchers
 
@@ -111,10 +111,9 @@ class Services:
         self._watchers = Watchers(settings.allow_watching, settings.max_message_mib * 2**20)
         self._references = ReferenceService(self._ready_engine, store)
         self.handlers: dict[str, dict[str, grpc.RpcMethodHandler]] = {}
+        self._localization = LocalizationService(self._ready_engine, metrics, store, self._watchers, recorder)
         reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, self)
-        localization_service_pb2_grpc.add_LocalizationServiceServicer_to_server(
-            LocalizationService(self._ready_engine, metrics, store, self._watchers, recorder), self
-        )
+        localization_service_pb2_grpc.add_LocalizationServiceServicer_to_server(self._localization, self)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self)
         if settings.reflection:
             self._add_reflection((*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME))
@@ -149,9 +148,10 @@ class Services:
         self._metrics.not_serving_because = f"starting: {step}"
         log.info("the server starts: %s", step)
 
-    async def open(self, engine: QueueEngine) -> None:
-        """Starts to serve, with an engine that has been warmed up."""
+    async def open(self, engine: QueueEngine, offer: Offer | None = None) -> None:
+        """Starts to serve, with an engine that has been warmed up; `offer` receives answers to single photographs."""
         self._engine = engine
+        self._localization.offer = offer
         await self.set_serving(True)
 
     async def drain(self, delay_s: float, grace_s: float) -> None:

@@ -54,6 +54,9 @@ if TYPE_CHECKING:  # services do not load what computes
 GiveBetter = Callable[[pb.LocalizeResponse], None]
 """Receives an answer that is better than those before, while the final one is computed."""
 
+Offer = Callable[[pb.LocalizeRequest, pb.LocalizeResponse, Query, Result], None]
+"""Receives a request and its answer, which may become a reference; must return at once."""
+
 
 class LocalizationService(rpcs.LocalizationServiceServicer):
     """Localizes photographs: single ones, rigs and sequences."""
@@ -78,6 +81,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._scenes = SceneFinder(store, self._reach)
         self._watchers = watchers
         self._recorder = recorder
+        self.offer: Offer | None = None
+        """Receives each answer to a single photograph, once it is made; None before the server serves."""
 
     async def Localize(self, request: pb.LocalizeRequest, call: Call) -> pb.LocalizeResponse:
         """Implements LocalizationService.Localize."""
@@ -169,6 +174,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._capture(request, response, call, [(query, result)])
         if not request.options.confidential:
             self._watchers.publish(result.scene_key, request, response, debug)
+        if self.offer is not None:
+            self.offer(request, response, query, result)
         return response
 
     async def _debug_of(self, answer: Answer, is_wanted: bool) -> pb.Debug | None:

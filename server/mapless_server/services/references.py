@@ -50,13 +50,17 @@ from .messages.references import (
     labels_from_message,
     nearly_ignored,
     new_provenance,
+    outdated_places,
     reference_to_message,
+    retired_to_message,
     scene_to_message,
 )
 from .reach import Reach, check_stays_in_reach
 
 if TYPE_CHECKING:  # services do not load what computes
+    from mapless.scenes import AdoptionPolicy
     from mapless_server.engine.queue_engine import QueueEngine
+    from mapless_server.scenes import ReferenceAudit
     from mapless_server.scenes.agreement import Agreement
 
 MAX_BATCH = 1000
@@ -112,6 +116,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         warnings = dict.fromkeys(agreement.warnings(scene.attributes.arbitrary_unit))
         if not agreement.contradicts_itself:  # else what its references say of lenses is of no use
             warnings |= await self._stored(self._lens_warnings, key)
+        if scene.attributes.adoption is not None:
+            warnings |= await self._stored(self._outdated_places, key, scene.attributes.adoption)
         return pb.GetSceneResponse(
             scene=scene_to_message(scene),
             warnings=warnings,
@@ -137,6 +143,15 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         # Older ones may be of a server that is gone, and of references that have been replaced.
         newest = max((it.generation for it in known.self_calibrations), default=0)
         return dict.fromkeys(it.lens for it in known.self_calibrations if it.lens and it.generation == newest)
+
+    def _outdated_places(self, key: SceneKey, policy: AdoptionPolicy) -> dict[str, None]:
+        """Says which places of a scene that adopts need a new survey."""
+        from mapless_server.scenes.adoption.policy import AdoptionOptions  # services do not load what computes
+        from mapless_server.store import adoption
+
+        shares = adoption.list_places(self._store.database, key, AdoptionOptions().least_photographs)
+        outdated = [name for name, share in shares.items() if share < policy.min_surveyed_share]
+        return dict.fromkeys([outdated_places(outdated)] if outdated else [])
 
     async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:
         """Implements ReferenceService.UpdateScene."""
@@ -251,8 +266,10 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def ListReferences(self, request: pb.ListReferencesRequest, call: Call) -> pb.ListReferencesResponse:
         """Implements ReferenceService.ListReferences."""
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
-        page = Page(request, call.principal.tenant, request.scene)
-        found = await self._stored(self._store.list_references, scene_key, page.limit, page.after)
+        only = {it: getattr(request, it) for it in ("only_adopted", "only_retired")}
+        some = "".join(f" {name}" for name, is_wanted in only.items() if is_wanted)
+        page = Page(request, call.principal.tenant, f"{request.scene}{some}")
+        found = await self._stored(partial(self._store.list_references, scene_key, page.limit, page.after, **only))
         references, token = page.cut(found, lambda reference: reference.reference_id)
         messages = await _many(reference_to_message, references)
         return pb.ListReferencesResponse(references=messages, next_page_token=token)
@@ -265,6 +282,12 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     def _delete_reference(self, engine: QueueEngine, scene_key: SceneKey, reference_id: str) -> None:
         engine.forget_references({self._store.delete_reference(scene_key, reference_id)})
+
+    async def RestoreReference(self, request: pb.RestoreReferenceRequest, call: Call) -> pb.RestoreReferenceResponse:
+        """Implements ReferenceService.RestoreReference."""
+        key, reference_id = await self._reach.reference_key(call, request.name, "name")
+        record = await self._stored(self._store.restore_reference, key, reference_id)
+        return pb.RestoreReferenceResponse(reference=reference_to_message(record))
 
     async def RetrieveReferences(
         self, request: pb.RetrieveReferencesRequest, call: Call
@@ -285,12 +308,18 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         engine = self._engine()
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
         reference_ids, token = await self._audit_page(request, scene_key, call)
-        if not reference_ids:
-            generation = await self._stored(self._store.get_generation, scene_key)
-            return pb.AuditSceneResponse(store_generation=generation)
+        generation = await self._stored(self._store.get_generation, scene_key)
+        audits: list[ReferenceAudit] = []
         are_listed = not request.references
-        generation, audits = await engine.audit(scene_key, reference_ids, call.caller, are_listed)
-        messages = map(audit_to_message, audits)
+        retired = await self._stored(self._store.list_retirements, scene_key, reference_ids)
+        if others := [it for it in reference_ids if it not in retired]:
+            generation, audits = await engine.audit(scene_key, others, call.caller, are_listed)
+        found = {it.name: it for it in map(audit_to_message, audits)}
+        for reference_id, why in retired.items():
+            name = names.reference_name(scene_id_of(scene_key), reference_id)
+            found[name] = retired_to_message(name, why)
+        in_order = [names.reference_name(scene_id_of(scene_key), it) for it in reference_ids]
+        messages = [found[it] for it in in_order if it in found]
         return pb.AuditSceneResponse(audits=messages, next_page_token=token, store_generation=generation)
 
     async def _audit_page(

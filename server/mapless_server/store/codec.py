@@ -44,7 +44,7 @@ from mapless.geodesy import Datum
 from mapless.geometry import Camera, Quaternion, RigidTransform
 from mapless.lenses import LENS_MODELS, Distortion, lens_model_of
 from mapless.provenance import GIVEN_POSE, Provenance, provenance_from_json, provenance_to_json
-from mapless.scenes import Calibration
+from mapless.scenes import AdoptionPolicy, Calibration
 from mapless_server.method.features.views import Features, KeptDepth, Matches, View
 
 from .records import SceneAttributes, SelfCalibration
@@ -107,6 +107,8 @@ def encode_attributes(attributes: SceneAttributes) -> bytes | None:
         del content["self_calibrations"]
     if not attributes.contradiction:  # likewise
         del content["contradiction"]
+    if attributes.adoption is None:  # as before schema 14
+        del content["adoption"]
     if attributes.calibration is not None and attributes.calibration.create_time is not None:
         content["calibration"]["create_time"] = attributes.calibration.create_time.isoformat()
     return to_json(content)
@@ -129,6 +131,7 @@ def decode_attributes(owner: str, data: bytes | None, sha256: str | None) -> Sce
             content.get("arbitrary_unit", False),  # which 0.2.0 did not write
             tuple(_calibration_from_dict(it) for it in content.get("self_calibrations", ())),
             content.get("contradiction", ""),
+            AdoptionPolicy(**content["adoption"]) if content.get("adoption") else None,
         )
 
 

@@ -32,12 +32,16 @@ from .tables import (
     features,
     global_descriptor,
     reference,
+    reference_standing,
     removed_reference,
     scene,
     scene_calibration,
     scene_generation,
     scene_label,
 )
+
+GENERATIONS_REMEMBERED = 100_000
+"""How far back `read_changes` knows what was deleted, some 10 MB per scene; older callers read the whole scene."""
 
 DETACHED = "-/"
 """Prefix of the keys of detached scenes: no tenant's name is a hyphen."""
@@ -175,6 +179,14 @@ def lock_changes(connection: Connection, scene_key: SceneKey) -> None:
     connection.execute(select(column.generation).where(column.scene_id == scene_key).with_for_update())
 
 
+def note_removals(connection: Connection, scene_key: SceneKey, generation: int, keys: Sequence[str]) -> None:
+    """Notes for `read_changes` which references are not chosen any more since a generation, and forgets the oldest."""
+    if keys:
+        tombstones = [{"scene_id": scene_key, "generation": generation, "reference_key": key} for key in keys]
+        connection.execute(insert(removed_reference), tombstones)
+    forget_removals(connection, scene_key, generation - GENERATIONS_REMEMBERED)
+
+
 def forget_removals(connection: Connection, scene_key: SceneKey, until_generation: int) -> None:
     """Deletes the tombstones up to a generation; callers that know an earlier one then read the whole scene."""
     removed = removed_reference.c
@@ -192,6 +204,14 @@ def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequen
     if reference_ids is not None:
         parts = [statement.where(column.reference_id.in_(ids)) for ids in _portions(reference_ids)]
     return {row.reference_id: row.key for part in parts for row in connection.execute(part)}
+
+
+def select_references() -> Select[Any]:
+    """Columns of `reference`, and those that say whether and why it is retired."""
+    standing = reference_standing.c
+    return select(reference, standing.retire_time_us, standing.retire_reason).outerjoin(
+        reference_standing, standing.reference_key == reference.c.key
+    )
 
 
 def find_key(connection: Connection, scene_key: SceneKey, reference_id: str) -> str:
@@ -284,6 +304,17 @@ def is_detached(scene_id: ColumnElement[str]) -> ColumnElement[bool]:
     return (scene_id >= DETACHED) & (scene_id < _DETACHED_END)
 
 
+def is_retired(key: ColumnElement[str]) -> ColumnElement[bool]:
+    """Whether the reference of a key is retired."""
+    standing = reference_standing.c
+    return (
+        select(standing.reference_key)
+        .where(standing.reference_key == key, standing.retire_time_us.is_not(None))
+        .correlate(reference)
+        .exists()
+    )
+
+
 def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> bool:
     """Inserts a row unless one with its primary key exists; returns whether it was inserted."""
     addition = _upsert(connection, table).values(row).on_conflict_do_nothing()
@@ -361,7 +392,7 @@ def read_changes(
 def _read(connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str) -> _Found:
     """The references that were added or described after a generation."""
     column, descriptor = reference.c, global_descriptor.c
-    is_changed = and_(column.scene_id == scene_key, column.generation > after_generation)
+    is_changed = and_(column.scene_id == scene_key, column.generation > after_generation, ~is_retired(column.key))
     indexed: Select[Any] = select(
         column.reference_id, column.key, column.geometry, column.geometry_sha256, descriptor.data, descriptor.sha256
     ).outerjoin(global_descriptor, and_(descriptor.reference_key == column.key, descriptor.name == descriptor_name))

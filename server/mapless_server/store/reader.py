@@ -188,7 +188,7 @@ class StoreReader:
         """
         with self.database.read() as connection:
             key = queries.find_key(connection, scene_key, reference_id)
-            row = connection.execute(select(tables.reference).where(tables.reference.c.key == key)).one()
+            row = connection.execute(queries.select_references().where(tables.reference.c.key == key)).one()
         return rows.reference_record(row)
 
     @observed
@@ -221,12 +221,25 @@ class StoreReader:
             return read(row, table.name)
 
     @observed
-    def list_references(self, scene_key: SceneKey, limit: int, after: str = "") -> list[ReferenceRecord]:
-        """At most `limit` references of a scene, ordered by id, with ids greater than `after`.
+    def list_references(
+        self,
+        scene_key: SceneKey,
+        limit: int,
+        after: str = "",
+        *,
+        only_adopted: bool = False,
+        only_retired: bool = False,
+    ) -> list[ReferenceRecord]:
+        """At most `limit` references of a scene, or of those, ordered by id, with ids greater than `after`.
 
         NotFound if there is no such scene; DataLoss if camera and pose of one of them are damaged.
         """
-        found = self._read_page(select(tables.reference), scene_key, limit, after)
+        statement, key = queries.select_references(), tables.reference.c.key
+        if only_adopted:
+            statement = statement.where(key.in_(select(tables.adopted_reference.c.reference_key)))
+        if only_retired:
+            statement = statement.where(queries.is_retired(key))
+        found = self._read_page(statement, scene_key, limit, after)
         return [rows.reference_record(row) for row in found]
 
     @observed

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from enum import Enum
 from functools import cached_property
 
 import numpy as np
@@ -13,7 +14,7 @@ from mapless.depth import DepthImage
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.provenance import GIVEN_POSE, Provenance
-from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration, Vector
+from mapless.scenes import MAX_FACTOR, MIN_FACTOR, AdoptionPolicy, Calibration, Vector
 from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
@@ -84,7 +85,8 @@ class SceneAttributes:
     The datum is the position of its world on the Earth; `down_in_world` the unit vector in the direction of gravity,
     None for that of the datum, if there is one. The calibration has measured factors of the radii of answers; the
     self-calibrations, one for each kind of answers, and the contradiction, a sentence if the scene contradicts itself,
-    are only filled for answers. ContradictingDown if datum and down_in_world do not belong to the same world;
+    are only filled for answers. The adoption policy says which localized photographs become references; None for none.
+    ContradictingDown if datum and down_in_world do not belong to the same world;
     DatumWithoutMetres if there is a datum, but the unit of length is arbitrary instead of the metre.
     """
 
@@ -94,6 +96,7 @@ class SceneAttributes:
     arbitrary_unit: bool = False
     self_calibrations: tuple[SelfCalibration, ...] = ()
     contradiction: str = ""
+    adoption: AdoptionPolicy | None = None
 
     @property
     def world(self) -> tuple[Datum | None, Vector | None, bool]:
@@ -173,6 +176,8 @@ class NewReference:
         mask: the bytes of its mask's file, unchanged; empty for none.
         provenance: how its pose is known.
         depth: the depth that was measured with it; None without one.
+        place_key: of an adopted one, the key of the surveyed reference that is nearest; empty if unknown.
+        usefulness: of an adopted one, see `Adopted`.
     """
 
     reference_id: str
@@ -184,6 +189,62 @@ class NewReference:
     mask: bytes = b""
     provenance: Provenance = GIVEN_POSE
     depth: DepthImage | None = None
+    place_key: str = ""
+    usefulness: float = 0.0
+
+
+class RetirementReason(str, Enum):
+    """Reasons why a reference is not chosen any more."""
+
+    CONTRADICTED = "contradicted"
+    """Photographs that should show what it shows do not, again and again."""
+    SURVEY_OUTDATED = "survey_outdated"
+    """Of an adopted one: photographs of its place show too little of what was surveyed."""
+    VOUCHERS_GONE = "vouchers_gone"
+    """Of an adopted one: the surveyed references that its pose rests on were deleted."""
+
+
+@dataclass(frozen=True)
+class Retirement:
+    """Since when, UTC, and why a reference is not chosen for photographs any more."""
+
+    time: datetime
+    reason: RetirementReason
+
+
+@dataclass(frozen=True)
+class Adopted:
+    """An adopted reference of a scene.
+
+    Attributes:
+        reference_id, key: of the reference.
+        place_key: key of the surveyed reference that is nearest; empty if unknown.
+        usefulness: share of what photographs of its place matched that it gave, a running mean, 0 to 1.
+        is_retired: whether it is not chosen any more.
+    """
+
+    reference_id: str
+    key: str
+    place_key: str
+    usefulness: float
+    is_retired: bool
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What photographs said of a reference since it was added or restored.
+
+    Attributes:
+        contradiction_count: photographs in a row that should show what it shows, and do not.
+        contradiction_time_us: when the last one was counted, microseconds since 1970.
+        surveyed_share: of a surveyed one, the share of matches with surveyed references in photographs of its place, a
+            running mean over `photograph_count` of them; None without any.
+    """
+
+    contradiction_count: int = 0
+    contradiction_time_us: int = 0
+    surveyed_share: float | None = None
+    photograph_count: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +263,8 @@ class ReferenceRecord:
         mask_sha256: hash of its mask's bytes, hexadecimal; empty without a mask.
         provenance: how its pose is known.
         depth_sha256: `DepthImage.sha256` of its depth; empty without one.
+        retired: since when, UTC, and why it is not chosen any more; None if it is. Of those that are listed or got one
+            by one.
     """
 
     scene_key: SceneKey
@@ -215,6 +278,7 @@ class ReferenceRecord:
     mask_sha256: str = ""
     provenance: Provenance = GIVEN_POSE
     depth_sha256: str = ""
+    retired: Retirement | None = None
 
     @property
     def scene_id(self) -> str:

@@ -25,6 +25,8 @@ from .records import (
     IndexedReference,
     NewReference,
     ReferenceRecord,
+    Retirement,
+    RetirementReason,
     SceneAttributes,
     SceneRecord,
     SelfCalibration,
@@ -154,7 +156,25 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
         mask_sha256=row.mask_sha256 or "",
         provenance=provenance,
         depth_sha256=row.depth_sha256 or "",
+        retired=retirement(row),
     )
+
+
+def retirement(row: Row[Any]) -> Retirement | None:
+    """Since when and why a reference is retired, if the row has columns of the table `reference_standing`."""
+    if getattr(row, "retire_time_us", None) is None:
+        return None
+    return Retirement(time_of(row.retire_time_us), RetirementReason(row.retire_reason))
+
+
+def adopted_row(record: ReferenceRecord, new: NewReference) -> dict[str, Any]:
+    """Makes a row of the table `adopted_reference`."""
+    return {
+        "reference_key": record.key,
+        "place_key": new.place_key,
+        "usefulness": new.usefulness,
+        "adopt_time_us": time_us(record.create_time),
+    }
 
 
 def feature_names(extractor: str) -> tuple[str, str]:

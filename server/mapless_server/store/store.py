@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, insert, select, update
+from sqlalchemy import Connection, delete, insert, select, update
 
 from mapless.geodesy import Datum
 from mapless.names import scene_name
-from mapless.scenes import UNCHANGED, Calibration, UnchangedType, Vector
+from mapless.provenance import ADOPTED
+from mapless.scenes import UNCHANGED, AdoptionPolicy, Calibration, UnchangedType, Vector
 from mapless_server.cache import LruCache
 from mapless_server.errors import AlreadyExists, DataLoss, NotFound, Overloaded
 from mapless_server.method.features.views import View
@@ -33,6 +34,7 @@ from .records import (
     NamedScenes,
     NewReference,
     ReferenceRecord,
+    Retirement,
     SceneAttributes,
     SceneRecord,
 )
@@ -41,9 +43,6 @@ from .sqlite import SqliteDatabase
 
 DEFAULT_CACHE_BYTES = 512 * 2**20
 """About 1,900 references with 2048 SIFT features each; 0 reads the database every time."""
-
-GENERATIONS_REMEMBERED = 100_000
-"""How far back `list_changes` knows what was deleted, some 10 MB per scene; older callers read the whole scene."""
 
 NO_ATTRIBUTES = SceneAttributes()
 
@@ -188,21 +187,23 @@ class Store(StoreReader):
         calibration: Calibration | UnchangedType | None = UNCHANGED,
         arbitrary_unit: bool | UnchangedType = UNCHANGED,
         labels: Mapping[str, str] | UnchangedType = UNCHANGED,
+        adoption: AdoptionPolicy | UnchangedType | None = UNCHANGED,
         limit: SceneLimit | None = None,
     ) -> SceneRecord:
         """Changes attributes of a scene, and all of its labels together; None deletes an attribute.
 
         Labels alone leave the generation as it is: nothing that is computed from a scene depends on them.
         Damaged attributes are replaced if datum, down_in_world and calibration are given; then the unit is the metre
-        unless it is given. NotFound if there is no such scene; DataLoss if an attribute that is not given is damaged;
-        ContradictingDown if datum and down_in_world do not belong to the same world; DatumWithoutMetres if there would
-        be a datum, and an arbitrary unit. A scene that is not within the limit, if there is one, is not there.
+        and nothing is adopted unless that is given. NotFound if there is no such scene; DataLoss if an attribute that
+        is not given is damaged; ContradictingDown if datum and down_in_world do not belong to the same world;
+        DatumWithoutMetres if there would be a datum, and an arbitrary unit. A scene that is not within the limit, if
+        there is one, is not there.
         """
         if isinstance(calibration, Calibration):
             calibration = replace(calibration, create_time=_now())
         given: dict[str, Any] = {"datum": datum, "down_in_world": down_in_world, "calibration": calibration}
         replaces_damaged = UNCHANGED not in given.values()
-        given["arbitrary_unit"] = arbitrary_unit
+        given |= {"arbitrary_unit": arbitrary_unit, "adoption": adoption}
         changes = {name: value for name, value in given.items() if value is not UNCHANGED}
         with self.changing() as connection:
             if changes or labels is UNCHANGED:
@@ -254,8 +255,15 @@ class Store(StoreReader):
             deletion.detach_scene(connection, scene_key)
 
     @observed
-    def add_references(self, scene_key: SceneKey, references: Sequence[NewReference]) -> list[ReferenceRecord]:
+    def add_references(
+        self,
+        scene_key: SceneKey,
+        references: Sequence[NewReference],
+        admit: Callable[[Connection], None] = lambda _: None,
+    ) -> list[ReferenceRecord]:
         """Adds all of the references or none, each with all its features and descriptors, as one change of the scene.
+
+        `admit` is called in the transaction, before anything is added, and may raise.
 
         Returns the new references in the order given. NotFound if there is no such scene; AlreadyExists if an id is
         taken or occurs twice (field "requests[i].reference_id"); ValueError if features are not float32, a number of a
@@ -267,7 +275,7 @@ class Store(StoreReader):
         # Encoding takes milliseconds per reference, so it is done before other writers have to wait.
         records = [rows.new_record(scene_key, new, now) for new in references]
         reference_rows = [rows.reference_row(record) for record in records]
-        image_rows, mask_rows, depth_rows, features_rows, descriptor_rows = [], [], [], [], []
+        image_rows, mask_rows, depth_rows, features_rows, descriptor_rows, adopted_rows = [], [], [], [], [], []
         for record, new in zip(records, references, strict=True):
             image_rows.append({"reference_key": record.key, "data": new.image})
             features_rows += [rows.features_row(record.key, *described) for described in new.views.items()]
@@ -276,8 +284,11 @@ class Store(StoreReader):
             if new.depth is not None:
                 depth_rows.append({"reference_key": record.key, "data": encode_depth_image(new.depth)})
             descriptor_rows += [rows.descriptor_row(record.key, *named) for named in new.descriptors.items()]
+            if new.provenance.source == ADOPTED:
+                adopted_rows.append(rows.adopted_row(record, new))
         with self.changing() as connection:
             generation = queries.begin_change(connection, scene_key, len(records))
+            admit(connection)
             queries.refuse_taken_ids(connection, scene_key, [new.reference_id for new in references])
             connection.execute(insert(tables.reference), [row | {"generation": generation} for row in reference_rows])
             connection.execute(insert(tables.image), image_rows)
@@ -288,6 +299,8 @@ class Store(StoreReader):
                 connection.execute(insert(tables.depth), depth_rows)
             if descriptor_rows:
                 connection.execute(insert(tables.global_descriptor), descriptor_rows)
+            if adopted_rows:
+                connection.execute(insert(tables.adopted_reference), adopted_rows)
         return records
 
     @observed
@@ -344,10 +357,38 @@ class Store(StoreReader):
             generation = queries.begin_change(connection, scene_key, -1)
             key = queries.find_key(connection, scene_key, reference_id)
             delete(connection, key)
-            tombstone = {"scene_id": scene_key, "generation": generation, "reference_key": key}
-            connection.execute(insert(tables.removed_reference).values(tombstone))
-            queries.forget_removals(connection, scene_key, generation - GENERATIONS_REMEMBERED)
+            queries.note_removals(connection, scene_key, generation, [key])
         return key
+
+    @observed
+    def list_retirements(self, scene_key: SceneKey, reference_ids: Sequence[str]) -> dict[str, Retirement]:
+        """Since when and why references of a scene are retired, by id, in the order of ids."""
+        column, standing = tables.reference.c, tables.reference_standing.c
+        is_wanted = column.reference_id.in_(reference_ids) & standing.retire_time_us.is_not(None)
+        retired = queries.select_references().where(column.scene_id == scene_key, is_wanted)
+        with self.database.read() as connection:
+            found = connection.execute(retired.order_by(column.reference_id)).all()
+        known = {it.reference_id: rows.retirement(it) for it in found}
+        return {name: it for name, it in known.items() if it is not None}
+
+    @observed
+    def restore_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
+        """Has a retired reference chosen again, and forgets what was held against it; others are left as they are.
+
+        NotFound if there is no such scene or reference.
+        """
+        standing, removed, scene = tables.reference_standing, tables.removed_reference, tables.scene
+        with self.changing() as connection:
+            generation = queries.begin_change(connection, scene_key)
+            key = queries.find_key(connection, scene_key, reference_id)
+            is_retired = select(queries.is_retired(tables.reference.c.key)).where(tables.reference.c.key == key)
+            if connection.scalar(is_retired):
+                connection.execute(delete(standing).where(standing.c.reference_key == key))
+                # Indexes never add a key again that they removed; so all of them read the whole scene.
+                connection.execute(delete(removed).where(removed.c.scene_id == scene_key))
+                its = update(scene).where(scene.c.scene_id == scene_key)
+                connection.execute(its.values(first_generation=generation))
+        return self.get_reference(scene_key, reference_id)
 
     @observed
     def try_writing(self) -> None:

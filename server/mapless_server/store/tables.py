@@ -16,7 +16,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 13
+SCHEMA_VERSION = 14
 
 metadata = MetaData()
 
@@ -94,7 +94,7 @@ reference = Table(
     Index("reference_by_geometry", "scene_id", "geometry"),
 )
 
-# Tombstones: references that were deleted in the latest generations of a scene, see store.GENERATIONS_REMEMBERED.
+# Tombstones: references that were deleted in the latest generations of a scene, see queries.GENERATIONS_REMEMBERED.
 removed_reference = Table(
     "removed_reference",
     metadata,
@@ -118,6 +118,34 @@ def _encoded(table: str, kind: str, length: int) -> Table:
     kind_column = Column(kind, String(length), primary_key=True)
     return Table(table, metadata, _reference_key(), kind_column, _bytes(), Column("sha256", _Sha256, nullable=False))
 
+
+# Localized photographs that became references, see adoption.py; what vouches for them is in their geometry.
+adopted_reference = Table(
+    "adopted_reference",
+    metadata,
+    _reference_key(),
+    Column("place_key", _Key, nullable=False),  # of the surveyed reference that is nearest; empty if unknown
+    # Share of what photographs of its place matched that it gave; the least useful go first.
+    Column("usefulness", Double, nullable=False),
+    Column("adopt_time_us", BigInteger, nullable=False),
+    Index("adopted_reference_by_place", "place_key"),
+    Index("adopted_reference_by_adopt_time", "adopt_time_us"),
+)
+
+# What photographs said of a reference since it was added or restored, see adoption.py; none if there is no row.
+reference_standing = Table(
+    "reference_standing",
+    metadata,
+    _reference_key(),
+    # Photographs in a row that should show what it shows, and do not; at most one an hour counts.
+    Column("contradiction_count", Integer, nullable=False, server_default=_NONE_YET),
+    Column("contradiction_time_us", BigInteger, nullable=False, server_default=_NONE_YET),
+    # Of a surveyed one: the share of matches with surveyed references in photographs of its place, a running mean.
+    Column("surveyed_share", Double),
+    Column("photograph_count", Integer, nullable=False, server_default=_NONE_YET),
+    Column("retire_time_us", BigInteger),  # null if it is not retired
+    Column("retire_reason", String(32)),
+)
 
 # Images, masks, depth and features have tables of their own, so that listing references does not read their bytes.
 image = Table("image", metadata, _reference_key(), _bytes())

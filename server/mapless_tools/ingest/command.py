@@ -179,6 +179,9 @@ def export_command(
     scene: Scene,
     folder: Annotated[Path, typer.Argument(help="Folder to write to; must be empty or not be there.")],
     format: Annotated[str, typer.Option(help="Layout: cameras, colmap, kapture, or gltf to look at.")] = "cameras",
+    adopted: Annotated[
+        str, typer.Option(help="References that were adopted from localized photographs: with, without or only.")
+    ] = "with",
     data_dir: DataDir = None,
     *,
     connection: Connection,
@@ -198,7 +201,7 @@ def export_command(
         check_target(folder, format)
         settings = _settings(data_dir, connection)
         with terminable(), connected(connection, settings) as client, progress_bars() as progress:
-            export = export_scene(client, scene, folder, format, progress)
+            export = export_scene(client, scene, folder, format, progress, adopted)
     for reason in export.damaged.values():
         print(f"skipped: {reason}", file=sys.stderr)
     if export.without_depth:

@@ -3,6 +3,7 @@
 It can also rescue a damaged store: undamaged references are written.
 """
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,8 +34,14 @@ def check_target(folder: Path, layout: str) -> None:
         raise ValueError(f"{folder} is not empty; an export does not write over anything")
 
 
-def export_scene(client: Client, scene: str, folder: Path, layout: str, progress: Progress) -> Export:
-    """Writes a scene's references into a folder, except damaged ones.
+WITH, WITHOUT, ONLY = "with", "without", "only"
+"""Exports of all references, of surveyed ones, and of adopted ones."""
+
+
+def export_scene(
+    client: Client, scene: str, folder: Path, layout: str, progress: Progress, adopted: str = WITH
+) -> Export:
+    """Writes a scene's references into a folder, except damaged ones; `adopted` says which.
 
     ValueError as in `check_target`, or without references. The layouts `cameras` and `kapture` also have the scene's
     datum, down and unit, and depths: `cameras` as they came, kapture in metres. A model of COLMAP has none. Masks are
@@ -45,6 +52,10 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
     nothing is left in the folder.
     """
     check_target(folder, layout)
+    if adopted not in (WITH, WITHOUT, ONLY):
+        raise ValueError(f"adopted must be {WITH}, {WITHOUT} or {ONLY}, not {adopted!r}")
+    if layout == "gltf" and adopted != WITH:
+        raise ValueError("gltf shows all references of a scene; --adopted is for the other formats")
     if layout == "gltf":
         from .gltf import export_gltf
 
@@ -65,13 +76,25 @@ def export_scene(client: Client, scene: str, folder: Path, layout: str, progress
         return PosedImage(name, reference.camera, reference.world_from_camera, has_mask, reference.provenance, depth)
 
     known = client.get_scene(scene)
-    images, damaged = fetch_all(client, scene, take, progress)
+    images, damaged = fetch_all(client, scene, take, progress, wanted=_wanted(client, scene, adopted))
     if images:
         for path, text in written.files(images, f"mapless scene {scene}", known).items():
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             with whole_file(folder / path) as file:
                 file.write_text(text, encoding="utf-8")
     return Export(len(images), damaged, len(left_out))
+
+
+def _wanted(client: Client, scene: str, adopted: str) -> Collection[str] | None:
+    """Ids of the references to write; None for all. ValueError if there are none."""
+    if adopted == WITH:
+        return None
+    found = [it.reference_id for it in client.list_references(scene, only_adopted=True, page_size=1000)]
+    if adopted == WITHOUT:
+        found = list({it.reference_id for it in client.list_references(scene, page_size=1000)} - set(found))
+    if not found:
+        raise ValueError(f"scene {scene} has no {'adopted' if adopted == ONLY else 'surveyed'} references")
+    return found
 
 
 def _write_depth(folder: Path, layout: Layout, image: str, reference: Reference) -> WrittenDepth | None:

@@ -1,7 +1,7 @@
 """Fetches the references of a scene concurrently; damaged ones are named."""
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ def fetch_all(
     take: Callable[[Reference], T],
     progress: Progress,
     pictures: int | None = None,
-    wanted: frozenset[str] | None = None,
+    wanted: Collection[str] | None = None,
 ) -> tuple[list[T], dict[str, str]]:
     """Calls `take`, in threads, for each reference, or for each of the `wanted` ids.
 

@@ -12,6 +12,8 @@ from mapless.labels import check_labels
 from mapless.provenance import GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
 from mapless.scenes import (
     Calibration,
+    adoption_from_message,
+    adoption_to_message,
     calibration_from_message,
     calibration_to_message,
     datum_from_message,
@@ -22,7 +24,15 @@ from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError, joined
 from mapless_server.scenes import Choice, ReferenceAudit
-from mapless_server.store import ContradictingDown, DatumWithoutMetres, ReferenceRecord, SceneAttributes, SceneRecord
+from mapless_server.store import (
+    ContradictingDown,
+    DatumWithoutMetres,
+    ReferenceRecord,
+    Retirement,
+    RetirementReason,
+    SceneAttributes,
+    SceneRecord,
+)
 
 from .enums import message_of
 
@@ -86,8 +96,37 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
         provenance=provenance_to_message(reference.provenance),
         depth_sha256=reference.depth_sha256,
     )
+    if reference.retired is not None:
+        message.retire_time.FromDatetime(reference.retired.time)
+        message.retirement = retirement_of(reference.retired)
     message.create_time.FromDatetime(reference.create_time)
     return message
+
+
+_RETIRED_BECAUSE = {
+    RetirementReason.CONTRADICTED: "photographs from about its viewpoint do not show what it shows",
+    RetirementReason.SURVEY_OUTDATED: "photographs of its place show too little of what was surveyed: survey it again",
+    RetirementReason.VOUCHERS_GONE: "the surveyed references that its pose rests on were deleted",
+}
+
+
+def retirement_of(retired: Retirement) -> str:
+    """One sentence for a person about why a reference is retired."""
+    return f"retired on {retired.time:%Y-%m-%d %H:%M} UTC: {_RETIRED_BECAUSE[retired.reason]}"
+
+
+MOST_NAMED = 10
+"""Places that one warning names."""
+
+
+def outdated_places(reference_ids: Sequence[str]) -> str:
+    """One sentence for a person that says which places, named by their surveyed references, need a new survey."""
+    more = len(reference_ids) - MOST_NAMED
+    named = ", ".join(reference_ids[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    return (
+        f"photographs around {named} show too little of what was surveyed, so that what was adopted there is retired: "
+        "survey these places again"
+    )
 
 
 def new_provenance(reference: pb.Reference, field: str) -> Provenance:
@@ -153,6 +192,11 @@ def audit_to_message(audit: ReferenceAudit) -> pb.ReferenceAudit:
     )
 
 
+def retired_to_message(reference: str, retired: Retirement) -> pb.ReferenceAudit:
+    """Message of the audit of a retired reference, which is compared with none, by its name."""
+    return pb.ReferenceAudit(name=reference, verdict=pb.AUDIT_VERDICT_RETIRED, message=retirement_of(retired))
+
+
 def scene_to_message(scene: SceneRecord) -> pb.Scene:
     """Message of a scene."""
     known = scene.attributes
@@ -165,6 +209,7 @@ def scene_to_message(scene: SceneRecord) -> pb.Scene:
         calibration=calibration_to_message(known.calibration) if known.calibration else None,
         arbitrary_unit=known.arbitrary_unit,
         labels=scene.labels,
+        adoption=adoption_to_message(known.adoption) if known.adoption else None,
     )
     message.create_time.FromDatetime(scene.create_time)
     return message
@@ -179,6 +224,7 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
             if request.HasField("down_in_world")
             else None,
             arbitrary_unit=request.arbitrary_unit,
+            adoption=adoption_from_message(request.adoption, "adoption") if request.HasField("adoption") else None,
         )
     except ContradictingDown as error:
         raise FieldError("down_in_world", str(error)) from None
@@ -230,5 +276,6 @@ _READERS: dict[str, Callable[[pb.Scene, str], object]] = {
     "down_in_world": _optional(direction_from_message),
     "calibration": _optional(_measured),
     "arbitrary_unit": lambda scene, path: scene.arbitrary_unit,
+    "adoption": _optional(adoption_from_message),
     "labels": lambda scene, path: labels_from_message(scene.labels, joined("scene", path)),
 }

@@ -16,7 +16,7 @@ all sessions share.
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ import numpy as np
 from mapless.depth import DepthSensor
 from mapless.geometry import Camera, RigidTransform
 from mapless.masks import FOLDER as MASKS
+from mapless.provenance import Provenance, provenance_from_json
 from mapless_tools.dataset import Dataset, DepthFile, finite_numbers, read_place
 
 from .collecting import Collector, ReadOptions, filled_lines, rotation_of, text_lines
@@ -70,7 +71,8 @@ def read(path: Path, options: ReadOptions) -> Dataset:
             if sensor not in cameras:
                 raise ValueError(f"sensor {sensor!r} is no camera of sensors.txt")
             camera, pose = cameras[sensor].camera(), poses.world_from_device(timestamp, sensor)
-            collector.add(image, camera, pose, depth=depths.at(timestamp, camera, pose))
+            known = _provenance(properties, image)
+            collector.add(image, camera, pose, provenance=known, depth=depths.at(timestamp, camera, pose))
     is_metric = is_capture or bool(properties.get("metric", False))
     dataset = collector.dataset(path.resolve().name, "kapture", metric=is_metric, source=f"kapture {path.name}")
     dataset = with_own_masks(dataset, collector.folder, path / MASKS)  # of our own exports
@@ -90,6 +92,15 @@ def _properties(file: Path) -> dict[str, Any]:
                 content = json.loads(line.removeprefix(PROPERTIES))
                 return content if isinstance(content, dict) else {}
     return {}
+
+
+def _provenance(properties: Mapping[str, Any], image: str) -> Provenance:
+    """How the pose of an image of our own exports is known; ValueError names what is wrong."""
+    content = properties.get("provenance", {})
+    try:
+        return provenance_from_json(content.get(image) if isinstance(content, Mapping) else content)
+    except ValueError as error:
+        raise ValueError(f"provenance: {error}") from None
 
 
 def _cameras(file: Path, wanted_kind: str) -> dict[str, ColmapCamera]:

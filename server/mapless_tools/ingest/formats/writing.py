@@ -108,7 +108,10 @@ def kapture_files(images: Sequence[PosedImage], source: str, scene: Scene | None
         records.append(f"{time}, {sensor}, {image.name}")
         trajectories += depths.add(time, image)
     cameras = [_sensor_row(sensor, "", "camera", camera) for camera, sensor in sensors.items()]
-    notes = [f"# {source}", f"{PROPERTIES}{json.dumps(_properties(scene))}"]
+    known = {it.name: provenance_to_json(it.provenance) for it in images}
+    provenance = {name: it for name, it in known.items() if it is not None}
+    properties = _properties(scene) | ({"provenance": provenance} if provenance else {})
+    notes = [f"# {source}", f"{PROPERTIES}{json.dumps(properties)}"]
     tables = {
         "sensors": [*notes, "# sensor_id, name, sensor_type, [sensor_params]+", *cameras, *depths.sensor_rows()],
         "trajectories": ["# timestamp, device_id, qw, qx, qy, qz, tx, ty, tz", *trajectories],

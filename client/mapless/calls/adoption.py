@@ -1,0 +1,42 @@
+"""What operators do about adopted and retired references."""
+
+from datetime import datetime
+from typing import Any
+
+from ..connection import Connection
+from ..messages import reference_from_message
+from ..names import reference_name
+from ..results import Reference
+from ..v1 import reference_service_pb2 as pb
+from .references import delete_reference, list_references
+
+
+async def restore_reference(
+    connection: Connection, scene: str, reference: str, *, timeout_s: float | None = None
+) -> Reference:
+    """Has a retired reference chosen again, and forgets what was held against it; one that is not retired is kept."""
+    request = pb.RestoreReferenceRequest(name=reference_name(scene, reference))
+    return await connection.call("RestoreReference", request, _reference, timeout_s)
+
+
+def _reference(response: Any) -> Reference:
+    return reference_from_message(response.reference)
+
+
+async def undo_adoption(
+    connection: Connection, scene: str, since: datetime, *, timeout_s: float | None = None
+) -> list[Reference]:
+    """Deletes the references that a scene has adopted since a time, one by one, and returns them.
+
+    Args:
+        scene: the scene.
+        since: the time, with time zone, by the server's clock.
+        timeout_s: deadline of each call.
+    """
+    if since.tzinfo is None:
+        raise ValueError("since must have a time zone")
+    adopted = [it async for it in list_references(connection, scene, only_adopted=True, timeout_s=timeout_s)]
+    chosen = [it for it in adopted if it.create_time >= since]
+    for it in chosen:
+        await delete_reference(connection, it.scene_id, it.reference_id, timeout_s=timeout_s)
+    return chosen

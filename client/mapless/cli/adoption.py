@@ -1,0 +1,100 @@
+"""Flags and commands about photographs that become references, and references that are retired."""
+
+import argparse
+from datetime import datetime, timezone
+
+from ..client import Client
+from ..results import Reference
+from ..scenes import AdoptionPolicy
+from .folder import EXIT_FAILED
+from .output import is_confirmed, show, table
+
+
+def add_policy(command: argparse.ArgumentParser) -> None:
+    """Adds the flags that `policy_of` reads."""
+    group, default = command.add_argument_group("adoption"), AdoptionPolicy()
+    group.add_argument(
+        "--adopt", action="store_true", help="localized photographs whose requests allow it become references"
+    )
+    for flag, kind, unit, text in (
+        ("most", int, "N", f"most adopted references at a place (default: {default.most_per_place})"),
+        ("trust", float, "TRUST", f"least trust of an answer (default: {default.min_trust:g})"),
+        ("radius", float, "M", f"largest 68 %% radius of a position (default: {default.max_radius_m:g})"),
+        ("surveyed", float, "SHARE", f"least share of surveyed matches (default: {default.min_surveyed_share:g})"),
+    ):
+        group.add_argument(f"--adopt-{flag}", type=kind, metavar=unit, help=text)
+
+
+def policy_of(arguments: argparse.Namespace) -> AdoptionPolicy | None:
+    """The adoption policy that the flags give; None without any. ValueError for one that is out of bounds."""
+    given = {
+        "most_per_place": arguments.adopt_most,
+        "min_trust": arguments.adopt_trust,
+        "max_radius_m": arguments.adopt_radius,
+        "min_surveyed_share": arguments.adopt_surveyed,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    return AdoptionPolicy(**given) if given or arguments.adopt else None
+
+
+def policy_text(policy: AdoptionPolicy | None) -> str | None:
+    """What a scene adopts, for a person; None if nothing."""
+    if policy is None:
+        return None
+    share = f"{100 * policy.min_surveyed_share:.0f} % surveyed"
+    return (
+        f"at most {policy.most_per_place} a place, trust {policy.min_trust:g}, "
+        f"within {policy.max_radius_m:g} (68 %), {share}"
+    )
+
+
+def add_actions(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Adds the actions of references that undo what the server did by itself."""
+    restore = actions.add_parser("restore", help="have a retired one chosen again")
+    restore.add_argument("scene")
+    restore.add_argument("reference")
+    restore.set_defaults(run=restore_reference)
+    undo = actions.add_parser("undo-adoption", help="delete those that were adopted since a time")
+    undo.add_argument("scene")
+    undo.add_argument(
+        "--since", required=True, type=_time, metavar="TIME", help="such as 2026-11-29 or 2026-11-29T18:00, UTC"
+    )
+    undo.add_argument("--yes", action="store_true", help="do not ask; only a terminal is asked")
+    undo.set_defaults(run=undo_adoption)
+
+
+def _time(text: str) -> datetime:
+    try:
+        found = datetime.fromisoformat(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no time such as 2026-11-29T18:00") from None
+    return found.replace(tzinfo=timezone.utc) if found.tzinfo is None else found
+
+
+def restore_reference(client: Client, arguments: argparse.Namespace) -> int:
+    """Has a retired reference chosen again."""
+    found = client.restore_reference(arguments.scene, arguments.reference)
+    return show(arguments, found, [f"{found.reference_id} is chosen for photographs"])
+
+
+def undo_adoption(client: Client, arguments: argparse.Namespace) -> int:
+    """Deletes what was adopted since a time; exit code 1 if the user, asked, does not want it."""
+    if not is_confirmed(arguments, f"delete what {arguments.scene} has adopted since {arguments.since.isoformat()}"):
+        return EXIT_FAILED
+    gone = client.undo_adoption(arguments.scene, arguments.since)
+    return show(arguments, gone, [f"{len(gone)} adopted references deleted", *(f"  {it.reference_id}" for it in gone)])
+
+
+def adopted_table(references: list[Reference]) -> list[str]:
+    """A table of adopted references, with what vouches for them."""
+    rows = []
+    for it in references:
+        vouchers = ", ".join(one.reference_id for one in it.provenance.vouchers[:3])
+        share = f"{100 * it.provenance.surveyed_share:.0f} %"
+        rows.append((it.reference_id, share, vouchers, f"{it.create_time:%Y-%m-%d %H:%M}", it.retirement))
+    return table(("REFERENCE", "SURVEYED", "VOUCHERS", "ADOPTED", "RETIRED"), rows)
+
+
+def retired_table(references: list[Reference]) -> list[str]:
+    """A table of retired references, with why."""
+    return table(("REFERENCE", "WHY"), [(it.reference_id, it.retirement) for it in references])

@@ -1,0 +1,225 @@
+"""Decides which localized photographs become references, and when references are retired.
+
+The pose of an adopted reference is that of its photograph localized a second time, from surveyed references alone. So
+no such pose rests on an adopted reference, errors do not add up however often a place changes, and what vouches for it
+can be counted. A third localization, of what the second did not explain, must not find another place:
+else a thing that was moved, as a poster, would take a photograph of another place along.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless.scenes import AdoptionPolicy
+from mapless_server.bounds import check_bounds
+from mapless_server.store.records import Standing
+
+
+@dataclass(frozen=True)
+class AdoptionOptions:
+    """Bounds of adoption that are the same for all scenes.
+
+    Attributes:
+        min_matches: least matches with surveyed references that agree with the pose from them.
+        min_vouchers, voucher_matches: least surveyed references with at least so many such matches.
+        min_novelty: least share of a photograph's keypoints that are not near a match of its answer.
+        explained_share: what is so near a match is explained by it, share of the image's longer side.
+        first_usefulness: most usefulness of a new reference, so that it cannot at once push out one that proved useful.
+        remembered: photographs that a running mean remembers.
+        least_photographs: photographs of a place before its survey is said to be outdated.
+        same_viewpoint_deg, same_viewpoint_share: a photograph that looks in a direction so near to a reference's, from
+            so near, a share of the distance to what it shows, should show what that shows.
+        contradicting_share: such a photograph contradicts the reference where it has a smaller share of its matches
+            with it, and agrees where it has twice that.
+        contradictions: contradictions in a row after which a reference is retired.
+        interval_s: time after a contradiction in which no other one counts, so that one visitor cannot retire any.
+    """
+
+    min_matches: int = 30
+    min_vouchers: int = 2
+    voucher_matches: int = 8
+    min_novelty: float = 0.2
+    explained_share: float = 0.04
+    first_usefulness: float = 0.2
+    remembered: int = 10
+    least_photographs: int = 5
+    same_viewpoint_deg: float = 15.0
+    same_viewpoint_share: float = 0.15
+    contradicting_share: float = 0.05
+    contradictions: int = 5
+    interval_s: float = 3600.0
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self, "min_matches min_vouchers voucher_matches remembered least_photographs contradictions", at_least=1
+        )
+        check_bounds(self, "min_novelty first_usefulness contradicting_share", at_least=0, at_most=1)
+        check_bounds(self, "explained_share same_viewpoint_share", above=0, at_most=1)
+        check_bounds(self, "same_viewpoint_deg", above=0, at_most=180)
+        check_bounds(self, "interval_s", at_least=0)
+
+
+class Refusal(str, Enum):
+    """Reasons why a photograph whose caller allows it is not adopted."""
+
+    UNCERTAIN = "uncertain"
+    """Its trust or radius does not reach the scene's policy, or the answer is not refined."""
+    UNSUPPORTED = "unsupported"
+    """Surveyed references alone do not localize it with that certainty, by enough matches."""
+    LITTLE_SURVEYED = "little_surveyed"
+    """They support too small a share of its matches."""
+    DISAGREES = "disagrees"
+    """They place it elsewhere than its answer."""
+    ELSEWHERE = "elsewhere"
+    """What they do not explain in it shows another place."""
+    NOTHING_NEW = "nothing_new"
+    """It shows nothing that the references lack."""
+    PLACE_FULL = "place_full"
+    """Its place has as many adopted references as it may, all more useful."""
+    CHANGED = "changed"
+    """The scene has changed meanwhile: it adopts no more, what vouches for it is gone, or another server was first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """An answer, as far as adoption is concerned.
+
+    Attributes:
+        world_from_camera: the pose.
+        position_68_m, position_95_m, rotation_68_deg, rotation_95_deg: its reported radii.
+        trust: its trust.
+        inlier_count: matches that agree with it.
+        inliers_of: the same for each reference that has some, by id.
+    """
+
+    world_from_camera: RigidTransform
+    position_68_m: float
+    position_95_m: float
+    rotation_68_deg: float
+    rotation_95_deg: float
+    trust: float
+    inlier_count: int
+    inliers_of: Mapping[str, int]
+
+    def agrees_with(self, other: "Evidence") -> bool:
+        """Whether both are one pose, within the hypotenuses of their 95 % radii, doubled: they share matches."""
+        ours, theirs = self.world_from_camera, other.world_from_camera
+        distance = float(np.linalg.norm(ours.translation - theirs.translation))
+        angle_deg = rotation_angle_deg(ours.rotation.T @ theirs.rotation)
+        near = 2 * math.hypot(self.position_95_m, other.position_95_m)
+        return distance <= near and angle_deg <= 2 * math.hypot(self.rotation_95_deg, other.rotation_95_deg)
+
+
+def is_certain(policy: AdoptionPolicy, found: Evidence) -> bool:
+    """Whether an answer reaches the trust and the radius of a scene's policy."""
+    return found.trust >= policy.min_trust and found.position_68_m <= policy.max_radius_m
+
+
+def surveyed_share(answered: Evidence, surveyed: Evidence | None) -> float:
+    """Share of a photograph's matches that surveyed references support, 0 to 1; `surveyed` is the answer from these."""
+    if surveyed is None:
+        return 0.0
+    return min(1.0, surveyed.inlier_count / max(answered.inlier_count, 1))
+
+
+def refusal(
+    policy: AdoptionPolicy, answered: Evidence, surveyed: Evidence | None, options: AdoptionOptions
+) -> Refusal | None:
+    """Why a photograph is not adopted by its answer, and that from surveyed references alone; None if it may be."""
+    if not is_certain(policy, answered):
+        return Refusal.UNCERTAIN
+    if surveyed is None or not is_certain(policy, surveyed):
+        return Refusal.UNSUPPORTED
+    vouchers = sum(it >= options.voucher_matches for it in surveyed.inliers_of.values())
+    if surveyed.inlier_count < options.min_matches or vouchers < options.min_vouchers:
+        return Refusal.UNSUPPORTED
+    if surveyed_share(answered, surveyed) < policy.min_surveyed_share:
+        return Refusal.LITTLE_SURVEYED
+    return None if surveyed.agrees_with(answered) else Refusal.DISAGREES
+
+
+def explained(size_px: tuple[int, int], inliers_px: Array, options: AdoptionOptions) -> NDArray[np.bool_]:
+    """Mask (H, W) of the pixels of an image, (width, height), that are near a match (M, 2) that agrees."""
+    width, height = size_px
+    drawn = np.zeros((height, width), np.uint8)
+    radius_px = max(1, round(options.explained_share * max(size_px)))
+    for x, y in np.rint(inliers_px).astype(int).tolist():
+        cv2.circle(drawn, (x, y), radius_px, (1,), cv2.FILLED)
+    return np.asarray(drawn > 0)
+
+
+def novelty(keypoints_px: Array, is_explained: NDArray[np.bool_]) -> float:
+    """Share of keypoints (K, 2) that no match explains; 0 without keypoints."""
+    if not len(keypoints_px):
+        return 0.0
+    height, width = is_explained.shape
+    columns, rows = np.rint(keypoints_px).astype(int).clip(0, [width - 1, height - 1]).T
+    return float((~is_explained[rows, columns]).mean())
+
+
+def mask_of(ignored: NDArray[np.bool_]) -> bytes:
+    """A mask file that ignores these pixels (H, W)."""
+    _, png = cv2.imencode(".png", np.where(ignored, 0, 255).astype(np.uint8))
+    return png.tobytes()
+
+
+def nearest_viewpoint(centres: Array, axes: Array, pose: RigidTransform) -> int:
+    """Index of the reference that stands nearest to a pose, of those that look within 60 degrees, or of all.
+
+    Centres (N, 3) and unit axes (N, 3) are in the world; at least one.
+    """
+    distance = np.linalg.norm(centres - pose.translation, axis=1)
+    looks = axes @ pose.rotation[:, 2] > 0.5
+    return int(np.where(looks, distance, np.inf).argmin() if looks.any() else distance.argmin())
+
+
+def should_show(
+    centres: Array, axes: Array, pose: RigidTransform, distance_m: float, options: AdoptionOptions
+) -> NDArray[np.intp]:
+    """Indices of the references that see what a photograph at a pose sees, which is at this distance."""
+    near = np.linalg.norm(centres - pose.translation, axis=1) <= options.same_viewpoint_share * distance_m
+    looks = axes @ pose.rotation[:, 2] >= math.cos(math.radians(options.same_viewpoint_deg))
+    return np.flatnonzero(near & looks)
+
+
+def with_share(standing: Standing, share: float, options: AdoptionOptions) -> Standing:
+    """What is known of a place after another photograph of it, of which surveyed references support this share."""
+    mean = share if standing.surveyed_share is None else standing.surveyed_share
+    weight = 1 / min(standing.photograph_count + 1, options.remembered)
+    mean += weight * (share - mean)
+    return replace(standing, surveyed_share=mean, photograph_count=standing.photograph_count + 1)
+
+
+def is_outdated(standing: Standing, policy: AdoptionPolicy, options: AdoptionOptions) -> bool:
+    """Whether photographs of a place show too little of what was surveyed."""
+    share, count = standing.surveyed_share, standing.photograph_count
+    return share is not None and count >= options.least_photographs and share < policy.min_surveyed_share
+
+
+def with_photograph(standing: Standing, share: float, now_us: int, options: AdoptionOptions) -> Standing:
+    """What is known of a reference after a photograph that should show what it shows has this share of matches with it.
+
+    Contradictions in a row are counted, one in each interval; a photograph that agrees ends the row.
+    """
+    if share >= 2 * options.contradicting_share:
+        return replace(standing, contradiction_count=0)
+    is_counted = now_us - standing.contradiction_time_us >= 1e6 * options.interval_s
+    if share >= options.contradicting_share or not is_counted:
+        return standing
+    return replace(standing, contradiction_count=standing.contradiction_count + 1, contradiction_time_us=now_us)
+
+
+def with_usefulness(usefulness: float, share: float, options: AdoptionOptions) -> float:
+    """Usefulness of an adopted reference after a photograph of its place that has this share of matches with it."""
+    return usefulness + (share - usefulness) / options.remembered
+
+
+def least_useful(usefulness: Sequence[float], most: int) -> int | None:
+    """Index of the reference that makes room for another at a place; None if the place has room."""
+    return None if len(usefulness) < most else int(np.argmin(usefulness))

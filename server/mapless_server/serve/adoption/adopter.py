@@ -1,0 +1,391 @@
+"""Has localized photographs become references of scenes that adopt, after they were answered, while the server is idle.
+
+An answer is offered on the event loop, which takes microseconds; one task then takes one photograph after another, when
+nothing has been computed for callers for a while. What is decided, and why, is in `scenes.adoption.policy`. Photographs
+wait in memory, in a queue that is bounded in number and bytes, and those that wait when the server stops are forgotten.
+"""
+
+import asyncio
+import hashlib
+import logging
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta, timezone
+
+import numpy as np
+
+from mapless.answers import Accuracy
+from mapless.axes import Axes
+from mapless.geometry import Array, RigidTransform
+from mapless.provenance import ADOPTED, MOST_VOUCHERS, Provenance, Voucher
+from mapless.scenes import AdoptionPolicy
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.query import Caller, Photo, Query, Result
+from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.errors import AlreadyExists, NotFound, RequestError
+from mapless_server.method.bundle.priors import NO_PRIORS
+from mapless_server.method.options import StageContext
+from mapless_server.scenes import ANYWHERE
+from mapless_server.scenes.adoption import policy as rules
+from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
+from mapless_server.scenes.observer import BackgroundObserver
+from mapless_server.scheduling import Flow
+from mapless_server.security import SceneKey
+from mapless_server.services.messages.answers import AnswerFrames, outcome_to_message
+from mapless_server.store import NewReference, RetirementReason, Store, adoption, time_us
+from mapless_server.store.records import Adopted
+
+from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px
+
+log = logging.getLogger(__name__)
+
+MAX_WAITING, MAX_WAITING_BYTES = 32, 64 * 2**20
+"""Photographs that wait to be considered, and their bytes together."""
+MOST_CHOSEN_AMONG = 1000
+"""Surveyed references that a photograph is localized from again: the nearest, as many as a request may name."""
+LIMIT_S = 120.0
+"""For each localization; the server is idle."""
+QUIET_S = 1.0
+LOOK_S = 0.02
+MAINTAINED_S = 60.0
+MOST_LOST_SHARE = 0.5
+"""Share of the vouching matches of an adopted reference whose references may be gone."""
+OWN_FLOW = Flow("", "adoption")
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An answered photograph that may become a reference.
+
+    Attributes:
+        query: as it was asked.
+        answered: its answer.
+        inliers_px: (M, 2) the keypoints of the matches that agree with it, pixels of the photograph as it was sent.
+    """
+
+    query: Query
+    answered: Evidence
+    inliers_px: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """The references of a scene around a candidate.
+
+    Attributes:
+        surveyed_ids, surveyed_keys, centres, axes: those that were not adopted; centres (N, 3) and axes (N, 3), world.
+        key: of the surveyed one that stands nearest, whose place it is.
+        reference_id: id of that one.
+    """
+
+    surveyed_ids: Sequence[str]
+    surveyed_keys: Sequence[str]
+    centres: Array
+    axes: Array
+    key: str
+    reference_id: str
+
+
+class Adopter:
+    """Considers answered photographs, one after another, and deletes adopted ones that are too old."""
+
+    def __init__(
+        self,
+        engine: QueueEngine,
+        store: Store,
+        observer: BackgroundObserver,
+        hours: float,
+        options: AdoptionOptions | None = None,
+        *,
+        quiet_s: float = QUIET_S,
+        now: Callable[[], datetime] = lambda: datetime.now(timezone.utc),
+    ) -> None:
+        """Makes the object; nothing is considered before `run`, or `consider`.
+
+        Adopted references are deleted when they are `hours` old. The server counts as idle when nothing was computed
+        for callers for `quiet_s`.
+        """
+        self._engine = engine
+        self._store = store
+        self._observer = observer
+        self._hours = hours
+        self._options = options
+        self._quiet_s = quiet_s
+        self._now = now
+        self._waiting: deque[Candidate] = deque()
+        self._waiting_bytes = 0
+        self._arrived = asyncio.Event()
+
+    @property
+    def waiting_count(self) -> int:
+        """Photographs that wait to be considered."""
+        return len(self._waiting)
+
+    def offer(self, request: pb.LocalizeRequest, response: pb.LocalizeResponse, query: Query, result: Result) -> None:
+        """Remembers an answered photograph that may be adopted; called on the event loop, after the answer is made."""
+        policy, asked = result.attributes.adoption, request.options
+        if policy is None or not asked.allow_adoption or asked.confidential or query.reference_ids or query.scenes:
+            return
+        if query.photo.exif is not None:  # its camera is a guess
+            return
+        evidence = evidence_of(response, result)
+        if evidence is None or evidence.trust < policy.min_trust or evidence.position_68_m > policy.max_radius_m:
+            self._observer.count("adoptions", 1, "uncertain")
+            return
+        size_bytes = query.photo.size_bytes
+        if len(self._waiting) >= MAX_WAITING or self._waiting_bytes + size_bytes > MAX_WAITING_BYTES:
+            self._observer.count("adoptions", 1, "queue")
+            return
+        self._waiting.append(
+            Candidate(replace(query, photo=replace(query.photo, depth=None)), evidence, inliers_px(result))
+        )
+        self._waiting_bytes += size_bytes
+        self._arrived.set()
+
+    async def run(self) -> None:
+        """Considers what is offered until it is cancelled; each failure is logged and counted, and ends nothing."""
+        maintained_s = -MAINTAINED_S
+        while True:
+            if time.monotonic() - maintained_s >= MAINTAINED_S:
+                await self._guarded(self.maintain())
+                maintained_s = time.monotonic()
+            if not self._waiting:
+                self._arrived.clear()
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(self._arrived.wait(), MAINTAINED_S)
+                continue
+            await self._until_idle()
+            candidate = self._waiting.popleft()
+            self._waiting_bytes -= candidate.query.photo.size_bytes
+            await self._guarded(self.consider(candidate))
+
+    async def _guarded(self, work: Awaitable[object]) -> None:
+        try:
+            await work
+        except RequestError as error:  # the scene is gone, the store is away, the server ends
+            self._observer.count("adoptions", 1, "failed")
+            log.warning("a photograph could not be considered as a reference: %s", error)
+        except Exception as error:
+            self._observer.count("adoptions", 1, "failed")
+            log.error("considering a photograph as a reference failed", exc_info=error)
+
+    async def _until_idle(self) -> None:
+        queue, since_s = self._engine.queue, time.monotonic()
+        busy_s = queue.busy_s
+        while time.monotonic() - since_s < self._quiet_s:
+            await asyncio.sleep(LOOK_S)
+            if queue.job_count or queue.busy_s > busy_s:
+                busy_s, since_s = queue.busy_s, time.monotonic()
+
+    async def maintain(self) -> None:
+        """Deletes adopted references that are too old, and retires those whose vouching references are gone."""
+        before = self._now() - timedelta(hours=self._hours)
+        for scene_key, reference_id in await asyncio.to_thread(adoption.list_expired, self._store.database, before):
+            await asyncio.to_thread(self._delete, scene_key, reference_id)
+            self._observer.count("adopted_expired")
+        for scene_key in await asyncio.to_thread(adoption.list_adopting_scenes, self._store.database):
+            lost = await asyncio.to_thread(adoption.missing_vouchers, self._store, scene_key)
+            gone = [key for key, share in lost.items() if share > MOST_LOST_SHARE]
+            await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
+
+    async def consider(self, candidate: Candidate) -> Refusal | None:
+        """Adopts a photograph, or says why not; also counts what it says of the references around.
+
+        RequestError if the scene is gone or the store is away.
+        """
+        options, scene_key = self._options or rules.AdoptionOptions(), candidate.query.scene_key
+        policy = (await asyncio.to_thread(self._store.get_attributes, scene_key)).adoption
+        if policy is None:
+            return self._counted(rules.Refusal.CHANGED)
+        place = await asyncio.to_thread(self._place, scene_key, candidate.answered.world_from_camera)
+        if place is None:
+            return self._counted(rules.Refusal.CHANGED)
+        result = await self._localized(candidate.query, place, candidate.query.photo.mask)
+        surveyed = self._evidence(candidate.query, result)
+        await self._learn(candidate, place, surveyed, result, policy, options)
+        refused = rules.refusal(policy, candidate.answered, surveyed, options)
+        if refused is None and surveyed is not None:
+            refused = await self._refusal_by_pixels(candidate, place, surveyed, result, options)
+        if refused is None and surveyed is not None:
+            refused = await self._adopt(candidate, place, surveyed, result, policy, options)
+        return self._counted(refused)
+
+    def _counted(self, refused: Refusal | None) -> Refusal | None:
+        self._observer.count("adoptions", 1, "adopted" if refused is None else refused.value)
+        return refused
+
+    def _place(self, scene_key: SceneKey, pose: RigidTransform) -> Place | None:
+        """The references around a pose; None without surveyed ones."""
+        context = StageContext(lambda: None)
+        entries = self._engine.references.retrievals[0].indexes.entries(scene_key, context, waits=False)
+        adopted = {it.key for it in adoption.list_adopted(self._store.database, scene_key)}
+        rows = entries.rows()
+        found = [(row, *entries.reference(row)[:2]) for row in rows.tolist()]
+        surveyed = [it for it in found if it[2] not in adopted]
+        if not surveyed:
+            return None
+        chosen = np.array([row for row, _, _ in surveyed], np.intp)
+        centres, axes = entries.centres(chosen), entries.axes(chosen)
+        nearest = rules.nearest_viewpoint(centres, axes, pose)
+        kept = np.argsort(np.linalg.norm(centres - pose.translation, axis=1), kind="stable")[:MOST_CHOSEN_AMONG]
+        return Place(
+            [surveyed[i][1] for i in kept.tolist()],
+            [surveyed[i][2] for i in kept.tolist()],
+            centres[kept],
+            axes[kept],
+            surveyed[nearest][2],
+            surveyed[nearest][1],
+        )
+
+    async def _localized(self, query: Query, place: Place, mask: bytes) -> Result:
+        """The photograph localized from surveyed references alone, without its priors and with another mask."""
+        again = replace(
+            query,
+            reference_ids=tuple(place.surveyed_ids),
+            rerank=True,
+            photo=replace(query.photo, mask=mask),
+            priors=NO_PRIORS,
+            narrowing=ANYWHERE,
+            attributes=None,
+            allow_coarse=False,
+        )
+        engine = self._engine
+        return await engine.run(engine.query_job(again, Caller(OWN_FLOW, time.monotonic() + LIMIT_S)))
+
+    @staticmethod
+    def _evidence(query: Query, result: Result) -> Evidence | None:
+        response = outcome_to_message(result, query.options, AnswerFrames(Axes.OPENCV, None), query.photo)
+        return evidence_of(response, result)
+
+    async def _refusal_by_pixels(
+        self, candidate: Candidate, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
+    ) -> Refusal | None:
+        """Why a photograph is not adopted by what the matches leave unexplained; None if it may be."""
+        photo = candidate.query.photo
+        size_px = photo.camera.width_px, photo.camera.height_px
+        by_all = await asyncio.to_thread(rules.explained, size_px, candidate.inliers_px, options)
+        if rules.novelty(keypoints_px(result), by_all) < options.min_novelty:
+            return rules.Refusal.NOTHING_NEW
+        ignored = await asyncio.to_thread(self._explained_by, photo, size_px, inliers_px(result), options)
+        other = self._evidence(candidate.query, await self._localized(candidate.query, place, ignored))
+        return None if other is None or other.agrees_with(surveyed) else rules.Refusal.ELSEWHERE
+
+    def _explained_by(self, photo: Photo, size_px: tuple[int, int], inliers: Array, options: AdoptionOptions) -> bytes:
+        """A mask of what matches explain, and of what the photograph's own mask ignores."""
+        explained = rules.explained(size_px, inliers, options)
+        own = photo.read_ignored(self._engine.options.image_limits)
+        return rules.mask_of(explained if own is None else explained | own)
+
+    async def _learn(
+        self,
+        candidate: Candidate,
+        place: Place,
+        surveyed: Evidence | None,
+        result: Result,
+        policy: AdoptionPolicy,
+        options: AdoptionOptions,
+    ) -> None:
+        """Counts what a photograph says of its place, of adopted references, and of those that should show the same."""
+        database, answered, now_us = self._store.database, candidate.answered, time_us(self._now())
+        share = rules.surveyed_share(answered, surveyed)
+        made = await asyncio.to_thread(
+            adoption.change_standings, database, [place.key], lambda _, it: rules.with_share(it, share, options)
+        )
+        here = [it for it in await self._adopted(candidate) if it.place_key == place.key and not it.is_retired]
+        if any(rules.is_outdated(it, policy, options) for it in made.values()):
+            retired = await self._retire(
+                candidate.query.scene_key, [it.key for it in here], RetirementReason.SURVEY_OUTDATED
+            )
+            if retired:
+                log.warning(
+                    "scene %s: the place of %s needs a new survey", candidate.query.scene_key, place.reference_id
+                )
+            return
+        total = max(answered.inlier_count, 1)
+        useful = {
+            it.key: rules.with_usefulness(it.usefulness, answered.inliers_of.get(it.reference_id, 0) / total, options)
+            for it in here
+        }
+        await asyncio.to_thread(adoption.set_usefulness, database, useful)
+        if surveyed is not None and rules.is_certain(policy, surveyed):
+            shares = self._shares(candidate, place, surveyed, result, options)
+            standings = await asyncio.to_thread(
+                adoption.change_standings,
+                database,
+                shares,
+                lambda key, it: rules.with_photograph(it, shares[key], now_us, options),
+            )
+            contradicted = [key for key, it in standings.items() if it.contradiction_count >= options.contradictions]
+            await self._retire(candidate.query.scene_key, contradicted, RetirementReason.CONTRADICTED)
+
+    async def _adopted(self, candidate: Candidate) -> list[Adopted]:
+        return await asyncio.to_thread(adoption.list_adopted, self._store.database, candidate.query.scene_key)
+
+    @staticmethod
+    def _shares(
+        candidate: Candidate, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
+    ) -> dict[str, float]:
+        """Share of a photograph's matches with each reference that should show what it shows, by key."""
+        pose = surveyed.world_from_camera
+        chosen = rules.should_show(place.centres, place.axes, pose, distance_shown(result), options)
+        total = max(surveyed.inlier_count, 1)
+        named = [(place.surveyed_keys[i], place.surveyed_ids[i]) for i in chosen.tolist()]
+        return {key: surveyed.inliers_of.get(reference_id, 0) / total for key, reference_id in named}
+
+    async def _adopt(
+        self,
+        candidate: Candidate,
+        place: Place,
+        surveyed: Evidence,
+        result: Result,
+        policy: AdoptionPolicy,
+        options: AdoptionOptions,
+    ) -> Refusal | None:
+        """Stores a photograph as a reference, in place of the least useful one where its place is full."""
+        scene_key, photo = candidate.query.scene_key, candidate.query.photo
+        here = [it for it in await self._adopted(candidate) if it.place_key == place.key]
+        leaves = rules.least_useful([it.usefulness for it in here], policy.most_per_place)
+        if leaves is not None and here[leaves].usefulness >= options.first_usefulness:
+            return rules.Refusal.PLACE_FULL
+        (found,) = await self._engine.describe([photo], Caller(OWN_FLOW, time.monotonic() + LIMIT_S))
+        vouchers = sorted(surveyed.inliers_of.items(), key=lambda it: -it[1])[:MOST_VOUCHERS]
+        radii = (surveyed.position_68_m, surveyed.position_95_m, surveyed.rotation_68_deg, surveyed.rotation_95_deg)
+        share = rules.surveyed_share(candidate.answered, surveyed)
+        vouching = tuple(Voucher(name, count) for name, count in vouchers)
+        new = NewReference(
+            f"adopted-{hashlib.sha256(photo.image).hexdigest()[:32]}",
+            photo.image,
+            photo.camera,
+            surveyed.world_from_camera,
+            found.views,
+            found.descriptors,
+            photo.mask,
+            Provenance(ADOPTED, Accuracy(*radii), share, vouching),
+            place_key=place.key,
+            usefulness=options.first_usefulness,
+        )
+        try:
+            record = await asyncio.to_thread(adoption.adopt, self._store, scene_key, new)
+        except (adoption.NotAdopted, AlreadyExists) as error:  # by the operator, or another server
+            log.info("a photograph is not adopted: %s", error)
+            return rules.Refusal.CHANGED
+        if leaves is not None:
+            await asyncio.to_thread(self._delete, scene_key, here[leaves].reference_id)
+        self._engine.references.agreements.changed(scene_key)
+        log.info("scene %s adopts %s at the place of %s", scene_key, record.reference_id, place.reference_id)
+        return None
+
+    def _delete(self, scene_key: SceneKey, reference_id: str) -> None:
+        with suppress(NotFound):  # another server was first
+            self._engine.forget_references({self._store.delete_reference(scene_key, reference_id)})
+
+    async def _retire(self, scene_key: SceneKey, keys: Sequence[str], reason: RetirementReason) -> Sequence[str]:
+        """Retires references; returns the keys of those that were not retired."""
+        if not keys:
+            return []
+        retired = await asyncio.to_thread(adoption.retire, self._store, scene_key, keys, reason)
+        self._observer.count("retirements", len(retired), reason.value)
+        return retired

@@ -1,0 +1,59 @@
+"""What an answer says, as far as adoption is concerned: its pose, radii and matches."""
+
+import numpy as np
+
+from mapless.geometry import Array
+from mapless.names import parse_reference_name
+from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.query import Result
+from mapless_server.method.bundle.estimate import PosedSupport
+from mapless_server.method.judge.answer import Localization
+from mapless_server.scenes.adoption.policy import Evidence
+from mapless_server.services.messages.debug import sent_pixels
+
+
+def evidence_of(response: pb.LocalizeResponse, result: Result) -> Evidence | None:
+    """The evidence of a response and the result that it was made of; None for a rejection, or a pose without radii."""
+    answer, localization = result.answer, response.localization
+    if not isinstance(answer.outcome, Localization) or not localization.HasField("accuracy"):
+        return None
+    ids = [parse_reference_name(it.name)[1] for it in result.references]
+    counts = zip(ids, answer.reference_inlier_counts, strict=True)
+    radii = localization.accuracy
+    return Evidence(
+        answer.outcome.world_from_camera,
+        radii.position_68_m,
+        radii.position_95_m,
+        radii.rotation_68_deg,
+        radii.rotation_95_deg,
+        answer.outcome.trust or 0.0,
+        answer.outcome.inlier_count,
+        {name: count for name, count in counts if count},
+    )
+
+
+def inliers_px(result: Result) -> Array:
+    """The keypoints (M, 2) of the matches that agree with a pose, pixels of the photograph as it was sent."""
+    support = result.answer.support
+    if not isinstance(support, PosedSupport):
+        return np.empty((0, 2))
+    keypoints = support.matches.keypoint[support.estimate.inliers]
+    if support.two_view is not None:
+        keypoints = np.concatenate([keypoints, support.two_view.keypoint[support.two_view.inliers]])
+    return sent_pixels(support.query, support.query.features.keypoints[keypoints])
+
+
+def keypoints_px(result: Result) -> Array:
+    """All keypoints (K, 2) of a photograph, pixels of it as it was sent."""
+    support = result.answer.support
+    return np.empty((0, 2)) if support is None else sent_pixels(support.query, support.query.features.keypoints)
+
+
+def distance_shown(result: Result) -> float:
+    """Median distance of the points that agree with a pose along its optical axis, metres; 0 without any."""
+    support = result.answer.support
+    if not isinstance(support, PosedSupport) or not support.estimate.inliers.any():
+        return 0.0
+    points = support.structure.x_in_world[support.matches.point[support.estimate.inliers]]
+    pose = support.estimate.world_from_camera
+    return float(np.median(pose.inverse().apply(points)[:, 2]))

@@ -1,0 +1,205 @@
+"""Adopted references, and what photographs said of references: which are retired, so that they are not chosen any more.
+
+An adopted reference is an ordinary one whose provenance says what vouches for it; a row in `adopted_reference` says
+where it belongs and how useful it is. A reference that is retired stays in the store, and leaves the indexes of all
+servers as a deleted one does (`queries.read_changes`); after it is restored they read the whole scene.
+
+Two servers that adopt one photograph give it the same id, so that the database refuses the second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import Connection, Select, select, update
+
+from mapless.provenance import ADOPTED, Voucher
+from mapless_server.errors import DataLoss, NotFound
+from mapless_server.security import SceneKey
+
+from . import queries, rows
+from .database import Database
+from .records import Adopted, NewReference, ReferenceRecord, RetirementReason, Standing
+from .store import Store
+from .tables import adopted_reference, reference, reference_standing
+
+
+class NotAdopted(Exception):
+    """A photograph is not adopted, because the scene or what vouches for it has changed meanwhile; says what."""
+
+
+def adopt(store: Store, scene_key: SceneKey, new: NewReference) -> ReferenceRecord:
+    """Adds an adopted reference, if the scene still adopts and what vouches for it is still there, in one transaction.
+
+    NotAdopted if not; AlreadyExists if another server was first; otherwise as `Store.add_references`.
+    """
+    if new.provenance.source != ADOPTED:
+        raise ValueError(f"the provenance must be {ADOPTED}, is {new.provenance.source}")
+
+    def admit(connection: Connection) -> None:
+        if rows.scene_attributes(queries.find_scene(connection, scene_key)).adoption is None:
+            raise NotAdopted("the scene adopts no photographs any more")
+        wanted = [it.reference_id for it in new.provenance.vouchers]
+        keys = queries.find_keys(connection, scene_key, wanted)
+        if len(keys) < len(wanted):
+            raise NotAdopted("a surveyed reference that vouches for it was deleted")
+
+    return store.add_references(scene_key, [new], admit)[0]
+
+
+def list_adopted(database: Database, scene_key: SceneKey) -> list[Adopted]:
+    """The adopted references of a scene, the least useful first; empty if there is no such scene."""
+    column, standing = adopted_reference.c, reference_standing.c
+    statement: Select[Any] = (
+        select(reference.c.reference_id, adopted_reference, standing.retire_time_us)
+        .join(adopted_reference, column.reference_key == reference.c.key)
+        .outerjoin(reference_standing, standing.reference_key == reference.c.key)
+        .where(reference.c.scene_id == scene_key)
+        .order_by(column.usefulness, column.adopt_time_us, reference.c.reference_id)
+    )
+    with database.read() as connection:
+        return [
+            Adopted(it.reference_id, it.reference_key, it.place_key, it.usefulness, it.retire_time_us is not None)
+            for it in connection.execute(statement)
+        ]
+
+
+def list_adopting_scenes(database: Database) -> list[SceneKey]:
+    """Keys of the scenes that have adopted references, ordered."""
+    scene_id = reference.c.scene_id
+    statement = (
+        select(scene_id)
+        .join(adopted_reference, adopted_reference.c.reference_key == reference.c.key)
+        .where(~queries.is_detached(scene_id))
+        .distinct()
+        .order_by(scene_id)
+    )
+    with database.read() as connection:
+        return [SceneKey(it) for it in connection.scalars(statement)]
+
+
+def list_expired(database: Database, before: datetime) -> list[tuple[SceneKey, str]]:
+    """Scene and id of the references that were adopted before a time, or are of a time to come, ordered."""
+    column, now_us = adopted_reference.c, rows.now_us()
+    is_expired = (column.adopt_time_us < rows.time_us(before)) | (column.adopt_time_us > now_us + CLOCKS_DIFFER_US)
+    statement: Select[Any] = (
+        select(reference.c.scene_id, reference.c.reference_id)
+        .join(adopted_reference, column.reference_key == reference.c.key)
+        .where(~queries.is_detached(reference.c.scene_id), is_expired)
+        .order_by(reference.c.scene_id, reference.c.reference_id)
+    )
+    with database.read() as connection:
+        return [(SceneKey(it.scene_id), it.reference_id) for it in connection.execute(statement)]
+
+
+CLOCKS_DIFFER_US = 60_000_000
+"""Clocks of servers that share a store may differ by so much; one that was set back prolongs nothing."""
+
+
+def missing_vouchers(store: Store, scene_key: SceneKey) -> dict[str, float]:
+    """Share of the vouching matches whose references are gone, by key, of adopted references that are not retired.
+
+    Only those that lack some. A reference that was stored after the adopted one is another with the same id.
+    """
+    found = dict[str, float]()
+    for adopted in list_adopted(store.database, scene_key):
+        if adopted.is_retired:
+            continue
+        try:
+            record = store.get_reference(scene_key, adopted.reference_id)
+        except (NotFound, DataLoss):  # deleted meanwhile; a damaged one is not used anyway
+            continue
+        vouchers = record.provenance.vouchers
+        lost = sum(it.match_count for it in vouchers if not _vouches(store, record, it))
+        if lost:
+            found[adopted.key] = lost / sum(it.match_count for it in vouchers)
+    return found
+
+
+def _vouches(store: Store, record: ReferenceRecord, voucher: Voucher) -> bool:
+    try:
+        there = store.get_reference(record.scene_key, voucher.reference_id)
+    except NotFound:
+        return False
+    except DataLoss:
+        return False
+    return there.create_time <= record.create_time and there.provenance.source != ADOPTED
+
+
+def set_usefulness(database: Database, usefulness: Mapping[str, float]) -> None:
+    """Stores the usefulness of adopted references, by key; those that are gone are passed over."""
+    with database.write() as connection:
+        for key, value in usefulness.items():
+            row = update(adopted_reference).where(adopted_reference.c.reference_key == key)
+            connection.execute(row.values(usefulness=value))
+
+
+def read_standings(database: Database, keys: Collection[str]) -> dict[str, Standing]:
+    """What photographs said of references, by key; those of which nothing was said are left out."""
+    column = reference_standing.c
+    with database.read() as connection:
+        found = connection.execute(select(reference_standing).where(column.reference_key.in_(sorted(keys))))
+        return {it.reference_key: _standing(it) for it in found}
+
+
+def _standing(row: Any) -> Standing:
+    share = row.surveyed_share
+    return Standing(row.contradiction_count, row.contradiction_time_us, share, row.photograph_count)
+
+
+def list_places(database: Database, scene_key: SceneKey, least_photographs: int) -> dict[str, float]:
+    """Share of matches with surveyed references in photographs of a scene's places, by id of their reference, ordered.
+
+    Only of places of which there were so many photographs.
+    """
+    standing = reference_standing.c
+    statement: Select[Any] = (
+        select(reference.c.reference_id, standing.surveyed_share)
+        .join(reference_standing, standing.reference_key == reference.c.key)
+        .where(reference.c.scene_id == scene_key, standing.photograph_count >= least_photographs)
+        .where(standing.surveyed_share.is_not(None))
+        .order_by(reference.c.reference_id)
+    )
+    with database.read() as connection:
+        return {it.reference_id: it.surveyed_share for it in connection.execute(statement)}
+
+
+def change_standings(
+    database: Database, keys: Collection[str], change: Callable[[str, Standing], Standing]
+) -> dict[str, Standing]:
+    """Changes what is known of references, by key, in one transaction; returns the new values.
+
+    References that are gone are passed over. Servers that count at once lose nothing: the rows are locked.
+    """
+    made = dict[str, Standing]()
+    column = reference_standing.c
+    with database.write() as connection:
+        for key in sorted(keys):
+            if connection.scalar(select(reference.c.key).where(reference.c.key == key)) is None:
+                continue
+            queries.insert_new(connection, reference_standing, {"reference_key": key})
+            row = connection.execute(select(reference_standing).where(column.reference_key == key).with_for_update())
+            made[key] = change(key, _standing(row.one()))
+            connection.execute(update(reference_standing).where(column.reference_key == key).values(vars(made[key])))
+    return made
+
+
+def retire(store: Store, scene_key: SceneKey, keys: Sequence[str], reason: RetirementReason) -> list[str]:
+    """Has references not chosen any more, as one change of the scene; returns the keys of those that were.
+
+    References that are gone or retired already are passed over. NotFound if there is no such scene.
+    """
+    column = reference.c
+    of_scene = select(column.key).where(column.scene_id == scene_key, column.key.in_(keys))
+    with store.changing() as connection:
+        generation = queries.begin_change(connection, scene_key)
+        chosen = list(connection.scalars(of_scene.where(~queries.is_retired(column.key)).order_by(column.key)))
+        values = {"retire_time_us": rows.now_us(), "retire_reason": reason.value}
+        for key in chosen:
+            queries.insert_new(connection, reference_standing, {"reference_key": key})
+            row = update(reference_standing).where(reference_standing.c.reference_key == key)
+            connection.execute(row.values(values))
+        queries.note_removals(connection, scene_key, generation, chosen)
+    return chosen

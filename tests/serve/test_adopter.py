@@ -1,0 +1,200 @@
+"""Photographs of the demo's room become references of a scene with half of its survey, by a server of its own."""
+
+import asyncio
+from collections.abc import Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta, timezone
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.servers import listening
+
+from mapless import AdoptionPolicy, Client, Rejected
+from mapless_server.scenes.adoption.policy import AdoptionOptions, Refusal
+from mapless_server.security import SceneKey
+from mapless_server.serve.adoption import adopter as module
+from mapless_server.serve.adoption.adopter import Adopter, Candidate
+from mapless_server.serve.opening import make_engine
+from mapless_server.settings import Settings
+from mapless_server.store import RetirementReason, Store, adoption
+from mapless_tools.demo.photographs import Photograph, Place
+from mapless_tools.demo.photographs import room as demo_room
+from mapless_tools.evaluate.metrics import pose_error
+
+POLICY = AdoptionPolicy(most_per_place=1, min_trust=0.3, max_radius_m=0.05)
+ROOM = SceneKey("room")
+
+
+@dataclass
+class Held:
+    """A server whose adopter considers nothing by itself."""
+
+    client: Client
+    store: Store
+    place: Place
+    adopter: Adopter
+    loop: asyncio.AbstractEventLoop
+
+    def candidate(self, photograph: Photograph) -> Candidate:
+        """What is left of a photograph after it was answered."""
+        answer = self.client.localize(photograph.data, photograph.camera, "room", allow_adoption=True)
+        assert not isinstance(answer, Rejected)
+        return self.adopter._waiting.pop()
+
+    def consider(self, candidate: Candidate) -> Refusal | None:
+        return asyncio.run_coroutine_threadsafe(self.adopter.consider(candidate), self.loop).result(120)
+
+    def maintain(self) -> None:
+        asyncio.run_coroutine_threadsafe(self.adopter.maintain(), self.loop).result(60)
+
+    @property
+    def adopted(self) -> list[str]:
+        return [it.reference_id for it in self.client.list_references("room", only_adopted=True)]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Held]:
+    data_dir, started = tmp_path_factory.mktemp("data"), Future[tuple[Adopter, asyncio.AbstractEventLoop]]()
+
+    async def run(self: Adopter) -> None:
+        started.set_result((self, asyncio.get_running_loop()))
+
+    settings = Settings(host="127.0.0.1", port=0, data_dir=data_dir, metrics=False, warm_up=False, features="sift")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module.Adopter, "run", run)
+        store = Store.open(data_dir)
+        with listening(settings, store, make_engine) as (running, _), Client(running.address) as client:
+            yield Held(client, store, demo_room(), *started.result(60))
+
+
+@pytest.fixture
+def held(server: Held) -> Iterator[Held]:
+    """The server with every second reference of the room."""
+    server.client.create_scene("room", adoption=POLICY)
+    server.client.add_references("room", [it.reference() for it in server.place.references[::2]])
+    yield server
+    server.client.delete_scene("room")
+
+
+def test_a_certain_photograph_with_something_new_is_adopted(held: Held) -> None:
+    query = held.place.queries[0]
+    candidate = held.candidate(query)
+    assert held.consider(candidate) is None
+    (found,) = held.client.list_references("room", only_adopted=True)
+    kept = held.client.get_reference("room", found.reference_id, include_image=True)
+    assert kept.image == query.data
+    assert kept.camera == query.camera
+    error_m, _ = pose_error(query.world_from_camera, kept.world_from_camera)
+    assert kept.provenance.accuracy is not None
+    assert error_m <= kept.provenance.accuracy.position_95_m
+    surveyed = {it.name for it in held.place.references[::2]}
+    assert {it.reference_id for it in kept.provenance.vouchers} <= surveyed
+    assert held.consider(candidate) in (Refusal.CHANGED, Refusal.NOTHING_NEW)  # as of another server
+    assert len(held.adopted) == 1
+
+
+def test_its_pose_never_rests_on_adopted_references(held: Held) -> None:
+    first, second = held.place.queries[4], held.place.queries[5]
+    assert held.consider(held.candidate(first)) is None
+    held.consider(held.candidate(second))
+    adopted = set(held.adopted)
+    for it in held.client.list_references("room", only_adopted=True):
+        assert not adopted & {voucher.reference_id for voucher in it.provenance.vouchers}
+
+
+def test_adoption_switched_off_in_the_middle_keeps_nothing(held: Held, monkeypatch: pytest.MonkeyPatch) -> None:
+    candidate = held.candidate(held.place.queries[0])
+    adopt = adoption.adopt
+
+    def late(store: Store, *asked: object) -> object:
+        store.update_scene(ROOM, adoption=None)
+        return adopt(store, *asked)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(adoption, "adopt", late)
+    assert held.consider(candidate) is Refusal.CHANGED
+    assert held.consider(candidate) is Refusal.CHANGED  # it is off before, too
+    assert held.adopted == []
+
+
+def test_a_moved_thing_takes_no_other_place_along(held: Held) -> None:
+    """Most of the photograph is of one place, and the rest of another, as with a poster that was carried there."""
+    here, there = held.place.queries[1], held.place.queries[6]
+    both = [_pixels(it) for it in (here, there)]
+    width = both[0].shape[1]
+    forged = np.concatenate([both[0][:, : width * 6 // 10], both[1][:, width * 6 // 10 :]], axis=1)
+    _, jpeg = cv2.imencode(".jpg", forged, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    candidate = held.candidate(replace(here, data=jpeg.tobytes()))
+    assert held.consider(candidate) is Refusal.ELSEWHERE
+    assert held.adopted == []
+
+
+def test_the_least_useful_of_a_full_place_goes_first(held: Held) -> None:
+    candidate = held.candidate(held.place.queries[0])
+    assert held.consider(candidate) is None
+    (first,) = held.adopted
+    noisy = _noisy(held.place.queries[0])
+    again = held.candidate(noisy)
+    options = replace(AdoptionOptions(), min_novelty=0.0)
+    held.adopter._options = options
+    try:
+        assert held.consider(again) is Refusal.PLACE_FULL
+        (only,) = adoption.list_adopted(held.store.database, ROOM)
+        adoption.set_usefulness(held.store.database, {only.key: 0.0})
+        held.adopter._options = replace(options, remembered=10**6)
+        assert held.consider(again) is None
+    finally:
+        held.adopter._options = None
+    assert len(held.adopted) == 1
+    assert held.adopted != [first]
+
+
+def _pixels(photograph: Photograph) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imdecode(np.frombuffer(photograph.data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+
+
+def _noisy(photograph: Photograph) -> Photograph:
+    image = _pixels(photograph).astype(float)
+    image += np.random.default_rng(0).normal(0, 2, image.shape)
+    _, jpeg = cv2.imencode(".jpg", image.clip(0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    return replace(photograph, data=jpeg.tobytes())
+
+
+def test_without_its_vouchers_an_adopted_reference_retires(held: Held) -> None:
+    assert held.consider(held.candidate(held.place.queries[0])) is None
+    (found,) = held.client.list_references("room", only_adopted=True)
+    held.maintain()
+    assert list(held.client.list_references("room", only_retired=True)) == []
+    for it in found.provenance.vouchers:
+        held.client.delete_reference("room", it.reference_id)
+    held.maintain()
+    (retired,) = held.client.list_references("room", only_retired=True)
+    assert retired.reference_id == found.reference_id
+    assert "were deleted" in retired.retirement
+
+
+def test_what_was_adopted_is_deleted_by_its_age(held: Held) -> None:
+    assert held.consider(held.candidate(held.place.queries[0])) is None
+    held.maintain()
+    assert len(held.adopted) == 1
+    held.client.update_scene("room", adoption=None)  # which prolongs nothing
+    held.adopter._now = lambda: datetime.now(timezone.utc) + timedelta(hours=25)
+    try:
+        held.maintain()
+    finally:
+        held.adopter._now = lambda: datetime.now(timezone.utc)
+    assert held.adopted == []
+    assert len(list(held.client.list_references("room"))) == 8
+
+
+def test_a_place_with_too_little_survey_left_is_named(held: Held) -> None:
+    assert held.consider(held.candidate(held.place.queries[0])) is None
+    candidate = held.candidate(held.place.queries[0])
+    crowded = replace(candidate, answered=replace(candidate.answered, inlier_count=10_000))
+    for _ in range(6):
+        assert held.consider(crowded) in (Refusal.LITTLE_SURVEYED, Refusal.UNSUPPORTED)
+    (retired,) = held.store.list_retirements(ROOM, held.adopted).values()
+    assert retired.reason is RetirementReason.SURVEY_OUTDATED
+    assert any("survey these places again" in it for it in held.client.get_scene("room").warnings)

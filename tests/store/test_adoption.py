@@ -1,0 +1,177 @@
+"""Adopted references, and references that are retired and restored; on either database."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+
+import pytest
+from support.stores import Place, make_reference
+
+from mapless import Accuracy, AdoptionPolicy, Provenance, Voucher
+from mapless_server.errors import AlreadyExists, NotFound
+from mapless_server.security import SceneKey
+from mapless_server.store import NewReference, RetirementReason, SceneAttributes, Store, adoption
+from mapless_server.store.records import Standing
+
+HALL = SceneKey("hall")
+ADOPTING = SceneAttributes(adoption=AdoptionPolicy(most_per_place=2))
+VOUCHERS = (Voucher("a", 40), Voucher("b", 20))
+RADII = Accuracy(0.01, 0.02, 0.1, 0.2)
+
+
+def adopted(name: str, usefulness: float = 0.2, vouchers: tuple[Voucher, ...] = VOUCHERS) -> NewReference:
+    provenance = Provenance("ADOPTED", RADII, 0.5, vouchers)
+    return replace(make_reference(name), provenance=provenance, place_key="place", usefulness=usefulness)
+
+
+def hall(store: Store) -> dict[str, str]:
+    """A scene that adopts, with two surveyed references; their keys."""
+    store.create_scene(HALL, ADOPTING)
+    return {it.reference_id: it.key for it in store.add_references(HALL, [make_reference("a"), make_reference("b")])}
+
+
+def indexed(store: Store, since: int | None = None) -> list[str]:
+    """Ids of the references that an index reads."""
+    return [it.reference_id for it in store.list_changes(HALL, since, "vlad").added]
+
+
+def test_what_vouches_for_an_adopted_reference_is_kept(place: Place) -> None:
+    with place.open() as store:
+        hall(store)
+        adoption.adopt(store, HALL, adopted("new"))
+    with place.open() as store:
+        assert store.get_reference(HALL, "new").provenance == Provenance("ADOPTED", RADII, 0.5, VOUCHERS)
+        assert [it.reference_id for it in store.list_references(HALL, 10, only_adopted=True)] == ["new"]
+        assert [it.reference_id for it in store.list_references(HALL, 10)] == ["a", "b", "new"]
+        assert adoption.list_adopting_scenes(store.database) == [HALL]
+
+
+def test_nothing_is_adopted_once_the_scene_stops(place: Place) -> None:
+    with place.open() as store:
+        hall(store)
+        store.update_scene(HALL, adoption=None)
+        with pytest.raises(adoption.NotAdopted, match="adopts no photographs any more"):
+            adoption.adopt(store, HALL, adopted("new"))
+        assert indexed(store) == ["a", "b"]
+
+
+def test_nothing_is_adopted_whose_voucher_was_deleted(place: Place) -> None:
+    with place.open() as store:
+        hall(store)
+        store.delete_reference(HALL, "b")
+        with pytest.raises(adoption.NotAdopted, match="vouches for it was deleted"):
+            adoption.adopt(store, HALL, adopted("new"))
+
+
+def test_of_two_servers_one_adopts_a_photograph(place: Place) -> None:
+    with place.open() as store:
+        hall(store)
+        other = store.uncached()
+        adoption.adopt(store, HALL, adopted("same"))
+        with pytest.raises(AlreadyExists):
+            adoption.adopt(other, HALL, adopted("same"))
+        assert len(adoption.list_adopted(store.database, HALL)) == 1
+
+
+def test_adopted_references_are_listed_by_usefulness(place: Place) -> None:
+    with place.open() as store:
+        hall(store)
+        keys = {name: adoption.adopt(store, HALL, adopted(name, it)).key for name, it in (("x", 0.3), ("y", 0.1))}
+        assert [it.reference_id for it in adoption.list_adopted(store.database, HALL)] == ["y", "x"]
+        adoption.set_usefulness(store.database, {keys["y"]: 0.5, "gone": 0.1})
+        found = adoption.list_adopted(store.database, HALL)
+        assert [(it.reference_id, it.usefulness, it.place_key) for it in found] == [
+            ("x", 0.3, "place"),
+            ("y", 0.5, "place"),
+        ]
+
+
+def test_old_adopted_references_expire_and_surveyed_do_not(place: Place) -> None:
+    with place.open() as store:
+        hall(store)
+        adoption.adopt(store, HALL, adopted("new"))
+        now = datetime.now(timezone.utc)
+        assert adoption.list_expired(store.database, now - timedelta(hours=1)) == []
+        assert adoption.list_expired(store.database, now + timedelta(hours=1)) == [(HALL, "new")]
+
+
+def test_an_adopted_reference_of_a_time_to_come_expires(place: Place) -> None:
+    """A clock that was set back prolongs nothing."""
+    with place.open() as store:
+        hall(store)
+        adoption.adopt(store, HALL, adopted("new"))
+        place.execute("UPDATE adopted_reference SET adopt_time_us = adopt_time_us + 3600000000")
+        assert adoption.list_expired(store.database, datetime.now(timezone.utc) - timedelta(hours=1)) == [(HALL, "new")]
+
+
+@pytest.mark.parametrize("how", ["deleted", "replaced"])
+def test_lost_vouchers_are_weighed_by_their_matches(place: Place, how: str) -> None:
+    with place.open() as store:
+        hall(store)
+        key = adoption.adopt(store, HALL, adopted("new")).key
+        assert adoption.missing_vouchers(store, HALL) == {}
+        store.delete_reference(HALL, "a")
+        if how == "replaced":  # by another photograph with its id
+            store.add_references(HALL, [make_reference("a")])
+        assert adoption.missing_vouchers(store, HALL) == {key: 40 / 60}
+
+
+def test_a_retired_reference_leaves_indexes_until_restored(place: Place) -> None:
+    with place.open() as store:
+        keys = hall(store)
+        before = store.get_generation(HALL)
+        assert adoption.retire(store, HALL, [keys["a"], "gone"], RetirementReason.CONTRADICTED) == [keys["a"]]
+        changes = store.list_changes(HALL, before, "vlad")
+        assert (len(changes.added), sorted(changes.removed)) == (0, [keys["a"]])
+        assert indexed(store) == ["b"]
+        retired = store.get_reference(HALL, "a").retired
+        assert retired is not None
+        assert retired.reason is RetirementReason.CONTRADICTED
+        assert list(store.list_retirements(HALL, ["a", "b"])) == ["a"]
+        assert [it.reference_id for it in store.list_references(HALL, 10, only_retired=True)] == ["a"]
+        between = store.get_generation(HALL)
+        assert store.restore_reference(HALL, "a").retired is None
+        for since in (before, between):
+            changes = store.list_changes(HALL, since, "vlad")
+            assert changes.is_whole
+            assert [it.reference_id for it in changes.added] == ["a", "b"]
+        assert indexed(store) == ["a", "b"]
+        assert store.get_scene(HALL).reference_count == 2
+
+
+def test_retiring_twice_and_restoring_others_changes_nothing(place: Place) -> None:
+    with place.open() as store:
+        keys = hall(store)
+        adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
+        assert adoption.retire(store, HALL, [keys["a"]], RetirementReason.SURVEY_OUTDATED) == []
+        assert store.restore_reference(HALL, "b").retired is None
+        retired = store.list_retirements(HALL, ["a", "b"])
+        assert {name: it.reason for name, it in retired.items()} == {"a": RetirementReason.CONTRADICTED}
+        with pytest.raises(NotFound):
+            store.restore_reference(HALL, "gone")
+
+
+def test_standings_are_counted_and_forgotten_when_restored(place: Place) -> None:
+    with place.open() as store:
+        keys = hall(store)
+
+        def counted(key: str, it: Standing) -> Standing:
+            return replace(it, contradiction_count=it.contradiction_count + 1, surveyed_share=0.25, photograph_count=5)
+
+        change: Callable[[str, Standing], Standing] = counted
+        for _ in range(2):
+            made = adoption.change_standings(store.database, [keys["a"], "gone"], change)
+        assert made == {keys["a"]: Standing(2, 0, 0.25, 5)} == adoption.read_standings(store.database, keys.values())
+        assert adoption.list_places(store.database, HALL, 5) == {"a": 0.25}
+        assert adoption.list_places(store.database, HALL, 6) == {}
+        adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
+        store.restore_reference(HALL, "a")
+        assert adoption.read_standings(store.database, keys.values()) == {}
+
+
+def test_the_policy_of_a_scene_is_kept(place: Place) -> None:
+    with place.open() as store:
+        hall(store)
+        store.update_scene(HALL, down_in_world=(0.0, 0.0, -1.0))
+        assert store.get_attributes(HALL).adoption == AdoptionPolicy(most_per_place=2)
+        assert store.update_scene(HALL, adoption=None).attributes.adoption is None
