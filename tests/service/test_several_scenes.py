@@ -37,6 +37,8 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless_server.services.capture.calls import decode_call
 from mapless_server.services.capture.folder import calls_of
+from mapless_server.settings import Settings
+from mapless_tools.replay.report import Selection, replay
 
 HALL, YARD = Datum(47.0, 8.0, 400.0), Datum(47.001, 8.0, 400.0)
 OTHERS = [tuple(wallpaper(seed) for seed in range(first, first + 3)) for first in (10, 20)]
@@ -239,12 +241,29 @@ def test_a_wrong_group_is_refused_by_its_field(
     assert refused.value.field == field
 
 
-def test_a_captured_call_is_kept_with_the_scene_that_was_found(
-    client: Client, tmp_path_factory: pytest.TempPathFactory
+def test_captured_calls_among_scenes_are_replayed_in_the_one_that_was_found(
+    client: Client, server: RunningServer, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    folder = tmp_path_factory.getbasetemp() / "several0" / "captured"
-    before = len(calls_of(folder))
-    found(client, group=SITE_A)
-    wait_until(lambda: len(calls_of(folder)) > before)
-    call = decode_call(calls_of(folder)[-1].read_bytes())
-    assert (call.scene_id, call.attributes.datum) == ("hall", HALL)
+    folder = tmp_path_factory.getbasetemp() / "several0"
+    before = set(calls_of(folder / "captured"))
+    moved = world_from_other_world(YARD, HALL).compose(TRUE)
+    asked: list[dict[str, Any]] = [
+        {"group": SITE_A},
+        {"scenes": ["yard", "hall"], "priors": GEO},
+        {"group": SITE_A, "prior_scene": "hall", "priors": Priors(pose=PosePrior.from_sigmas(TRUE, 0.05, 1.0))},
+        {"group": SITE_A, "prior_scene": "yard", "priors": Priors(pose=PosePrior.from_sigmas(moved, 0.05, 1.0))},
+        {"group": {}},
+    ]
+    for where in asked:
+        client.localize(PHOTO, CAMERA, **where)
+    client.localize_rig(rig_of([photograph(it) for it in WALK[:2]]), group=SITE_A)
+    wait_until(lambda: len(calls_of(folder / "captured")) == len(before) + len(asked) + 1)
+    new = [decode_call(it.read_bytes()) for it in calls_of(folder / "captured") if it not in before]
+    assert {(it.scene_id, it.attributes.datum) for it in new} == {("hall", HALL)}
+    settings = Settings(data_dir=folder / "data", features="sift", backend="geometric", background_matching=False)
+    wanted = Selection(frozenset(it.request_id for it in new))
+    calls = replay(folder / "captured", wanted, settings).calls
+    *computed, ambiguous, rig = calls
+    assert [(it.verdict, it.changes, it.error) for it in (*computed, rig)] == [("identical", (), "")] * len(asked)
+    assert (ambiguous.verdict, ambiguous.outcome_then) == ("not computed", "ambiguous")
+    assert "poses in two scenes" in ambiguous.error

@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from mapless_server.engine.groups import (
     GroupResult,
 )
 from mapless_server.engine.query import TRACK, Query, Result, SceneQuestion
+from mapless_server.errors import RequestError
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.structure.model import MetricScale
@@ -171,7 +173,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         debug = await self._debug_of(answer, request.options.include_debug or is_watched)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
-        self._capture(request, response, call, [(query, result)])
+        prior_attributes = await self._prior_attributes(request, response.scene, call)
+        self._capture(request, response, call, [(query, result)], prior_attributes)
         if not request.options.confidential:
             self._watchers.publish(result.scene_key, request, response, debug)
         if self.offer is not None:
@@ -315,9 +318,25 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         for attempt in (attempt for result in results for attempt in result.attempts):
             self._metrics.attempted(attempt.rung, attempt.outcome)
 
-    def _capture(self, request: Request, response: Response, call: Call, parts: Sequence[tuple[Query, Result]]) -> None:
+    async def _prior_attributes(self, request: pb.LocalizeRequest, scene: str, call: Call) -> SceneAttributes | None:
+        """Attributes of the scene in whose world the priors of a captured request are, if it is not the answer's."""
+        if self._recorder is None or request.prior_scene in ("", scene):
+            return None
+        scene_key = await self._reach.scene_key(call, request.prior_scene, "prior_scene")
+        with suppress(RequestError):  # it was deleted meanwhile
+            return await asyncio.to_thread(self._store.get_attributes, scene_key)
+        return None
+
+    def _capture(
+        self,
+        request: Request,
+        response: Response,
+        call: Call,
+        parts: Sequence[tuple[Query, Result]],
+        prior_attributes: SceneAttributes | None = None,
+    ) -> None:
         if self._recorder is not None and not request.options.confidential:
-            self._recorder.record(request, response, call, parts, self._engine().tiers)
+            self._recorder.record(request, response, call, parts, self._engine().tiers, prior_attributes)
 
 
 async def better_then_final(

@@ -15,12 +15,16 @@ from mapless import wire
 from mapless.geometry import rotation_angle_deg
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.query import TRACK
 from mapless_server.services.capture.calls import Response, diagnostics_of
 
 DESCRIBE = "describe"
 """The stage in which a server extracts the features that a replay already has."""
-NO_ANSWER = ("request_id", "server_version", "captured", "attempts", "missing_evidence") + tuple(
-    f"{name}_duration" for name in ("queue", "total", "processor")
+SCENES = "scenes"
+"""The stage in which a photograph is matched with references of several scenes, of which a replay computes one."""
+NO_ANSWER = (
+    *("request_id", "server_version", "captured", "attempts", "missing_evidence", "scenes", "searched_scene_count"),
+    *(f"{name}_duration" for name in ("queue", "total", "processor")),
 )
 """Fields of diagnostics that are no part of the answer."""
 ABSENT = "-"
@@ -50,7 +54,8 @@ class Comparison:
 
 def compare(then: Response, now: Response) -> Comparison:
     """Compares a captured answer with a new one."""
-    first, second = _essence(then), _essence(now)
+    is_among = any(it.searched_scene_count > 1 for it in diagnostics_of(then))
+    first, second = _essence(then, is_among), _essence(now, is_among)
     for before, after in zip(_with_intrinsics(first), _with_intrinsics(second), strict=False):
         # Servers before 0.4 do not send it.
         if after.HasField("used_intrinsics") and not before.HasField("used_intrinsics"):
@@ -91,14 +96,19 @@ def outcome_of(response: Any) -> str:
     return str(reasons[response.rejection.reason].name).removeprefix("REJECTION_REASON_").lower()
 
 
-def _essence(response: Any) -> Any:
-    """A copy without the fields that are not part of the answer."""
+def _essence(response: Any, is_among: bool) -> Any:
+    """A copy without the fields that are not part of the answer.
+
+    Among several scenes the stages begin with the choice of references, and the attempt near a prior is made in the
+    scene of the prior, if at all: so neither the order of stages nor that attempt is a part of it.
+    """
     copy = type(response)()
     copy.CopyFrom(response)
     for diagnostics in diagnostics_of(copy):
         for name in NO_ANSWER:
             diagnostics.ClearField(name)
-        kept = [it.stage for it in diagnostics.stages if it.stage != DESCRIBE]
+        kept = [it.stage for it in diagnostics.stages if it.stage not in (DESCRIBE, SCENES)]
+        kept = sorted({*kept} - {TRACK}) if is_among else kept
         del diagnostics.stages[:]
         diagnostics.stages.extend(pb.StageTiming(stage=it) for it in kept)
     return copy

@@ -49,6 +49,8 @@ from mapless_server.store import (
     codec,
 )
 
+from .several import ScenesOfCall, in_found_scene, in_scene_of, no_extents
+
 Joined = TypeVar("Joined")
 
 _CALLER_FAILS = pb.LADDER_CUT_REASON_CALLER_FAILS
@@ -206,9 +208,9 @@ def recompute(
     """
     then = response_of(call)
     references.check(call)
-    request = MESSAGES[call.method][0].FromString(call.request)
+    request = in_found_scene(MESSAGES[call.method][0].FromString(call.request), then, call)
     engine = cast(QueueEngine, _Recomputing(call, request, then, references, tiers, options))
-    store = cast(Store, SimpleNamespace(get_attributes=lambda _: call.attributes))
+    store = cast(Store, ScenesOfCall(call))
     service = LocalizationService(lambda: engine, Metrics(), store, Watchers(False))
     now = Call(call.request_id, time.monotonic(), math.inf, Principal(tenant=call.tenant))
     return cast(Response, asyncio.run(getattr(service, call.method)(request, now)))
@@ -218,6 +220,7 @@ class _Recomputing:
     """The part of the engine that services call; a photograph is identified by its field in the request."""
 
     parallel_queries = 1
+    references = SimpleNamespace(extents_m=no_extents)
 
     def __init__(
         self,
@@ -230,7 +233,7 @@ class _Recomputing:
     ) -> None:
         self.options = options
         self._call = call
-        self._references = references
+        self._stored = references
         self._tiers = tiers
         self._parts = {part.field: part for part in call.parts}
         described = zip(self._parts, diagnostics_of(then), strict=True)
@@ -240,10 +243,10 @@ class _Recomputing:
         self._method = unrefined if _is_cut_short(request, then) else Method()
 
     def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> SearchJob:
-        field = query.photo.field
+        query, field = in_scene_of(query, self._call), query.photo.field
         extractor, part = self._tiers[0].extractor, self._parts[field]
         any_roll = next((it.features for it in self._tiers if it.any_roll), None)
-        recorded = RecordedSource(self._call, part, self._references, extractor, field in self._described, any_roll)
+        recorded = RecordedSource(self._call, part, self._stored, extractor, field in self._described, any_roll)
         views = QueryViews(query.photo, self.options.image_limits)
         cuts = [(it.rung, it.features) for it in self._then[field].ladder_cuts if it.reason == _CALLER_FAILS]
         search = Search.begin(query, recorded, views, math.inf)

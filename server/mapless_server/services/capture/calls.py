@@ -71,6 +71,7 @@ class CapturedCall:
         scene_id: id of the scene within its tenant.
         circumstances: all else that decides an answer (versions, settings, weights), by name.
         attributes: attributes of the scene.
+        prior_attributes: those of the scene in whose world priors were given, if it is another of several scenes.
         parts: one for each photograph.
         request: the message as it was received.
         response: the message as it was sent.
@@ -83,6 +84,7 @@ class CapturedCall:
     scene_id: str
     circumstances: Mapping[str, str] = field(default_factory=dict)
     attributes: SceneAttributes = field(default_factory=SceneAttributes)
+    prior_attributes: SceneAttributes | None = None
     parts: tuple[CapturedPart, ...] = ()
     request: bytes = b""
     response: bytes = b""
@@ -101,7 +103,8 @@ def encode_call(call: CapturedCall) -> bytes:
     header = {
         "format": FORMAT_VERSION,
         **{name: getattr(call, name) for name in _PLAIN},
-        "attributes": json.loads(codec.encode_attributes(call.attributes) or b"null"),
+        "attributes": _attributes_to_json(call.attributes),
+        "prior_attributes": None if call.prior_attributes is None else _attributes_to_json(call.prior_attributes),
         "parts": [_part_to_dict(part) for part in call.parts],
         "request_bytes": len(call.request),
     }
@@ -132,12 +135,17 @@ def decode_call(data: bytes) -> CapturedCall:
         return CapturedCall(
             **{name: header[name] for name in _PLAIN},
             attributes=_attributes_of(header["attributes"]),
+            prior_attributes=_attributes_of(prior) if (prior := header.get("prior_attributes")) else None,
             parts=tuple(_part_of(it) for it in header["parts"]),
             request=messages[: header["request_bytes"]],
             response=messages[header["request_bytes"] :],
         )
     except (ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError, codec.Damaged) as error:
         raise CaptureError(f"its header is not one of ours: {error}") from error
+
+
+def _attributes_to_json(attributes: SceneAttributes) -> Any:
+    return json.loads(codec.encode_attributes(attributes) or b"null")
 
 
 def _attributes_of(content: object) -> SceneAttributes:

@@ -28,6 +28,7 @@ from mapless_server.rpc import Call
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import check_tenant, scene_id_of
 from mapless_server.settings import Settings
+from mapless_server.store import SceneAttributes
 
 from .calls import CapturedCall, CapturedPart, CaptureError, Request, Response, diagnostics_of
 from .folder import CaptureFolder
@@ -94,11 +95,13 @@ class Recorder:
         call: Call,
         parts: Sequence[tuple[Query, Result]],
         tiers: Sequence[Tier],
+        prior_attributes: SceneAttributes | None = None,
     ) -> None:
         """Queues an answered call for writing, with its photographs in order and their results.
 
         Called on the event loop. Of several scenes, the call is kept with the one of its answer. The response's
-        diagnostics are set to say whether the call is captured. The tiers are all of the server.
+        diagnostics are set to say whether the call is captured. The tiers are all of the server; `prior_attributes` are
+        as of `CapturedCall`.
         """
         tenant = call.principal.tenant
         if self._tenants and tenant not in self._tenants:
@@ -117,6 +120,7 @@ class Recorder:
             tenant,
             scene_id_of(result.scene_key or query.scene_key),
             attributes=result.attributes,
+            prior_attributes=prior_attributes,
             parts=tuple(captured_part(*part) for part in parts),
             request=messages[0].SerializeToString(),
             response=messages[1].SerializeToString(),
