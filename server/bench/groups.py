@@ -1,8 +1,8 @@
 """`python -m bench.groups DATA`: photographs are looked for among all scenes of a folder, as with their scene named.
 
 Of each folder some photographs are left out, which are then asked with their scene named, and among all scenes; and
-among the scenes of other places only, where none must be localized. Then all references are stored once more, as one
-scene, and in many small ones: what a group of so many scenes costs beside one scene of all references.
+among the scenes of other places only, where none must be localized. Of 200 scenes, those of the folders and others
+with the mirror images of their photographs, the cost is compared with that of one scene of all references.
 
 The engine works in this process, without work in the background, on a store that has all features. Processor time is
 that of a query's stages, by turns, after a first query that fills the caches.
@@ -10,13 +10,15 @@ that of a query's stages, by turns, after a first query that fills the caches.
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
 
+import cv2
 import numpy as np
 import typer
 
@@ -42,8 +44,8 @@ LIMIT_S = 600.0
 ALL = SceneKey("all")
 APART = 10_000.0
 """Distance of the folders' worlds in the one scene of all references."""
-SMALL = 4
-"""References of a scene of the many small ones."""
+SCENES, SMALL = 200, 2
+"""Scenes of the group whose cost is measured, and references of those with mirror images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,6 @@ class Counts:
     among_s: float = 0.0
     outside: int = 0
     accepted_outside: int = 0
-    notes: list[str] = field(default_factory=list)
 
     def line(self, name: str) -> str:
         """The row of a table."""
@@ -120,27 +121,42 @@ def folders_of(scenes: Scenes, most: int, photographs: int) -> Iterator[Folder]:
             yield Folder(keys[name], dataset.metric, references, asked, same_place)
 
 
-def store_all(store: Store, engine: QueueEngine, folders: Sequence[Folder]) -> None:
-    """Stores each folder's references as a scene; all of them as one; and as many small ones."""
-    store.create_scene(ALL, SceneAttributes(arbitrary_unit=True))
-    for number, folder in enumerate(folders):
+def store_folders(store: Store, engine: QueueEngine, folders: Sequence[Folder]) -> None:
+    """Stores each folder's references as a scene."""
+    for folder in folders:
         store.create_scene(folder.scene, SceneAttributes(arbitrary_unit=not folder.metric))
-        for i, frame in enumerate(folder.references):
-            photo = Photo(frame.image_path.read_bytes(), frame.camera, "image")
-            (found,) = describe_all(engine, [photo])
-            small = SceneKey(f"small-{number}-{i // SMALL}")
-            if i % SMALL == 0:
-                store.create_scene(small, SceneAttributes(arbitrary_unit=not folder.metric))
-            pose = frame.world_from_camera
-            away = pose.shifted(np.array([APART * number, 0.0, 0.0]))
-            for scene, name, at in (
-                (folder.scene, f"r{i}", pose),
-                (small, f"r{i}", pose),
-                (ALL, f"r{number}-{i}", away),
-            ):
-                new = NewReference(name, photo.image, photo.camera, at, found.views, found.descriptors)
-                store.add_references(scene, [new])
+        store.add_references(folder.scene, [described(engine, it, f"r{i}") for i, it in enumerate(folder.references)])
         print(f"stored {folder.scene}: {len(folder.references)} references", flush=True)
+
+
+def described(engine: QueueEngine, frame: Frame, name: str, is_mirrored: bool = False) -> NewReference:
+    """A reference with all features, of a photograph or of its mirror image."""
+    image = frame.image_path.read_bytes()
+    if is_mirrored:
+        pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        assert pixels is not None, frame.image_path
+        image = cv2.imencode(".jpg", cv2.flip(pixels, 1))[1].tobytes()
+    (found,) = describe_all(engine, [Photo(image, frame.camera, "image")])
+    return NewReference(name, image, frame.camera, frame.world_from_camera, found.views, found.descriptors)
+
+
+def store_many(store: Store, engine: QueueEngine, folders: Sequence[Folder]) -> list[SceneKey]:
+    """Stores many scenes, and one of all their references; returns the many, those of the folders first."""
+    scenes = {folder.scene: [described(engine, it, "") for it in folder.references] for folder in folders}
+    frames = [it for folder in folders for it in folder.references]
+    for k in range(SCENES - len(folders)):
+        some = [frames[(k * SMALL + i) % len(frames)] for i in range(SMALL)]
+        scenes[SceneKey(f"mirrored-{k}")] = [described(engine, it, "", is_mirrored=True) for it in some]
+    store.create_scene(ALL)
+    for number, (scene, references) in enumerate(scenes.items()):
+        store.create_scene(scene)
+        store.add_references(scene, [replace(it, reference_id=f"r{i}") for i, it in enumerate(references)])
+        away = np.array([APART * number, 0.0, 0.0])
+        moved = ((it, it.world_from_camera.shifted(away)) for it in references)
+        named = [replace(it, reference_id=f"r{number}-{i}", world_from_camera=at) for i, (it, at) in enumerate(moved)]
+        store.add_references(ALL, named)
+    print(f"stored {len(scenes)} scenes of {sum(map(len, scenes.values()))} references, and these as one", flush=True)
+    return list(scenes)
 
 
 def same(first: Result, second: Result) -> bool:
@@ -201,53 +217,67 @@ def said(result: Result) -> str:
     return f"{result.scene_key} {what} [{tried}] [{rungs}]"
 
 
-def measure_many(asked: Asked, store: Store, folders: Sequence[Folder], count: int) -> Iterator[str]:
-    """What photographs cost among many small scenes, and in one scene of all references."""
-    small = [it.scene_key for it in store.list_scenes("default", 100_000) if it.scene_key.startswith("small-")]
-    frames = [it.photographs[0] for it in folders][:count]
-    times = []
-    for frame in frames:
-        asked.ask(frame, ALL)
-        asked.ask(frame, *small)
-        one, many, again, last = (asked.ask(frame, *scenes)[1] for scenes in ([ALL], small, small, [ALL]))
+def measure_many(asked: Asked, folders: Sequence[Folder], scenes: Sequence[SceneKey]) -> Iterator[str]:
+    """What photographs cost among many scenes, and in one of all references, by turns (A B B A)."""
+    times, found = [], Counter[str]()
+    for folder in folders:
+        frame = folder.photographs[0]
+        first = [asked.ask(frame, ALL)[0], asked.ask(frame, *scenes)[0]]
+        one, many, again, last = (asked.ask(frame, *some)[1] for some in ([ALL], scenes, scenes, [ALL]))
         times.append((one + last, many + again))
+        found.update(["all"] * isinstance(first[0].answer.outcome, Localization))
+        found.update(["many"] * isinstance(first[1].answer.outcome, Localization))
         print(
-            f"  {frame.image_path.parent.parent.name}: {500 * (one + last):.0f} ms, {500 * (many + again):.0f}",
-            flush=True,
+            f"  {folder.scene}: {500 * (one + last):.0f} ms, {500 * (many + again):.0f}; {said(first[1])}", flush=True
         )
     one_s, many_s = np.sum(times, axis=0) / 2 / len(times)
-    yield f"one scene of all references: {1e3 * one_s:.0f} ms a photograph"
-    yield f"{len(small)} scenes: {1e3 * many_s:.0f} ms, {many_s / one_s:.2f} times"
+    yield f"one scene of all references: {1e3 * one_s:.0f} ms a photograph, {found['all']} of {len(folders)} localized"
+    yield f"{len(scenes)} scenes: {1e3 * many_s:.0f} ms, {many_s / one_s:.2f} times, {found['many']} localized"
+
+
+def measure_folders(asked: Asked, folders: Sequence[Folder], outside: int) -> Iterator[str]:
+    """A row for each folder, and their sum."""
+    yield from HEADER
+    total = Counts()
+    for it in folders:
+        counts = measure(asked, it, folders, outside)
+        yield counts.line(it.scene)
+        for name in vars(total):
+            setattr(total, name, getattr(total, name) + getattr(counts, name))
+    yield total.line("all")
+
+
+def of_other_places(folders: Sequence[Folder]) -> list[Folder]:
+    """One folder of each place."""
+    chosen: list[Folder] = []
+    for it in folders:
+        if not any(other.scene in it.same_place for other in chosen):
+            chosen.append(it)
+    return chosen
 
 
 def main(
     data: Annotated[Path, typer.Argument(help="Folder of the scenes' folders.")],
     photographs: Annotated[int, typer.Option(min=1, help="Photographs of each folder that are left out.")] = 8,
-    references: Annotated[int, typer.Option(min=2, help="Photographs of each folder at most.")] = 60,
+    references: Annotated[int, typer.Option(min=3, help="Photographs of each folder at most.")] = 60,
     outside: Annotated[int, typer.Option(min=0, help="Of each folder, asked among other places.")] = 10,
     tiers: Annotated[int, typer.Option(min=1, help="Kinds of features that are used, the cheapest first.")] = 3,
-    folder: Annotated[Path | None, typer.Option(help="Where the store is kept for another time.")] = None,
+    many: Annotated[bool, typer.Option(help="Measure the cost of many scenes instead.")] = False,
 ) -> None:
-    """Compare answers among all scenes with those of the scene named."""
+    """Compare answers among all scenes with those of the scene named; settings are those of the environment."""
     with failures_end_command(), TemporaryDirectory() as temporary:
-        where = folder or Path(temporary)
-        where.mkdir(exist_ok=True)
-        is_made = any(where.iterdir())
         loop, folders = asyncio.new_event_loop(), list(folders_of(Scenes(data), references, photographs))
-        made = make_tiers(load_settings({"data_dir": str(where)}).settings)
-        with closing(loop), Store.open(where) as store:
+        made = make_tiers(load_settings({"data_dir": temporary}).settings)
+        with closing(loop), Store.open(Path(temporary)) as store:
             engine = engine_over(store, made[:tiers], EngineOptions(workers=1))
-            if not is_made:
-                store_all(store, engine, folders)
-            asked, total = Asked(engine, loop), Counts()
-            print("\n".join(HEADER), flush=True)
-            for it in folders:
-                counts = measure(asked, it, folders, outside)
-                print(counts.line(it.scene), flush=True)
-                for name in vars(total):
-                    setattr(total, name, getattr(total, name) + getattr(counts, name))
-            print(total.line("all"), flush=True)
-            for line in measure_many(asked, store, folders, len(folders)):
+            asked = Asked(engine, loop)
+            if many:
+                chosen = of_other_places(folders)
+                lines = measure_many(asked, chosen, store_many(store, engine, chosen))
+            else:
+                store_folders(store, engine, folders)
+                lines = measure_folders(asked, folders, outside)
+            for line in lines:
                 print(line, flush=True)
             loop.run_until_complete(engine.close())
 
