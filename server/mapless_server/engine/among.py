@@ -83,21 +83,26 @@ def _chosen(search: Search, tier: Tier) -> tuple[Sequence[Chosen], Search]:
 def _by_matches(search: Search, found: Sequence[Chosen], tier: Tier, compared: Compared) -> tuple[RankedScene, ...]:
     """The scenes by the agreement of the photograph's matches with their references, and by similarity.
 
-    Those of a sample of its keypoints suffice if they agree with the best scene's. Of the others all keypoints count
-    where the sample's matches may agree, since it is said of them whether they do.
+    Those of a sample of its keypoints suffice if they agree with the best scene's. Where the sample's matches may agree
+    with another one's, all keypoints count, of the two references that match most, as many as a pose needs.
     """
     matcher, check = tier.pipeline.matcher, search.context.check
     loaded = [(it, references) for it in found if (references := _loaded(search, it, tier))]
-    everything = [it for _, some in loaded for it in some]
     with search.context.stage("scenes"):
-        sample, step = matcher.match_sample(compared, everything, check)
+        sample, step = matcher.match_sample(compared, [it for _, some in loaded for it in some], check)
         ranked = _in_order(_agreements(loaded, compared.query, sample, step))
         if not ranked or step == 1:
             return ranked
         is_clear = ranked[0].agreement >= LEAST_AGREEMENT
-        unclear = [it for it in ranked[int(is_clear) :] if not is_clear or it.agreement >= PROMISE.agreement]
-        again = {it.question.scene_key for it in unclear}
-        some = [it for it in loaded if it[0][0].scene_key in again]
+        others = [it for it in ranked[1:] if it.agreement >= PROMISE.agreement]
+        again = {it.question.scene_key for it in (others if is_clear else ranked)}
+        counts = {it.key: len(them) for it, them in zip((r for _, some in loaded for r in some), sample, strict=True)}
+        most = 2 if is_clear else len(counts)
+        some = [
+            (it, tuple(sorted(references, key=lambda one: -counts[one.key])[:most]))
+            for it, references in loaded
+            if it[0].scene_key in again
+        ]
         matches = matcher.match_compared(compared, [it for _, them in some for it in them], check)
         known = [it for it in ranked if it.question.scene_key not in again]
         return _in_order([*known, *_agreements(some, compared.query, matches, 1)])

@@ -66,8 +66,7 @@ class SceneGroup:
         begun = begun_scenes(tried) - self.left_out
         if len(begun) >= SCENES:
             return None
-        left = (i for i in range(len(self.ranking)) if i not in begun and i not in self.left_out)
-        return next((i for i in left if not begun or self.ranking[i].agreement > 0), None)
+        return next((i for i in range(len(self.ranking)) if i not in begun and i not in self.left_out), None)
 
     def tried_scenes(self, tried: Collection[Attempt]) -> tuple[SceneTried, ...]:
         """The scenes in the order of their ranks, after these attempts."""

@@ -1,15 +1,19 @@
 """Properties of a photograph after an attempt, on which the rungs of the ladder depend."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
-from mapless_server.method.judge.hypothesis import Doubt
+from mapless_server.method.judge.hypothesis import Attempt, Doubt
 from mapless_server.method.ladder import Situation
 from mapless_server.method.options import Variant
 from mapless_server.method.promise import UNKNOWN, Known, PromiseOptions
 from mapless_server.method.rejection import Rejection
 
 from .query import Tier
+from .scene_group import SceneGroup
 from .search import Search
+
+CHEAPEST = "wide"
+"""The rung that is worth its time where matches agree least."""
 
 
 def any_roll_of(tiers: Sequence[Tier]) -> int | None:
@@ -30,10 +34,16 @@ def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions)
         any_roll=any_roll_of(tiers),
         angles_deg=search.angles_deg,
         has_depth=search.coarse is not None and search.coarse.prepared.has_depth,
-        other_scene=None if search.group is None else search.group.next_scene(search.tried),
+        other_scene=None if search.group is None else _other_scene(search.group, search.tried, promise),
         known=_known(search),
         promise=promise,
     )
+
+
+def _other_scene(group: SceneGroup, tried: Collection[Attempt], promise: PromiseOptions) -> int | None:
+    """The next scene, if its matches show so much that at least the cheapest rung would be worth its time in it."""
+    rank = group.next_scene(tried)
+    return rank if rank is not None and Known(group.ranking[rank].agreement).is_worth(CHEAPEST, promise) else None
 
 
 def _known(search: Search) -> Known:
