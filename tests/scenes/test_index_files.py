@@ -305,7 +305,9 @@ class TestMaking:
             os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)
             one = IndexedReference("a", "b", RigidTransform(np.eye(3), np.zeros(3)), np.ones(16, np.float32))
             content = index_writer.Content(Identity("", "", 0, "", 16), 1, "", [[one]])
-            index_writer.write_index(Path({str(path)!r}), content)
+            path = Path({str(path)!r})
+            with index_writer.unfinished(path) as file:
+                index_writer.write_index(path, file, content)
         """
         killed = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], check=False)
         assert killed.returncode == -9

@@ -17,7 +17,7 @@ from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.scenes.retrieval import index as retrieval_index
 from mapless_server.scenes.retrieval.index import SceneIndex
 from mapless_server.scenes.retrieval.index_file import Identity, IndexFile
-from mapless_server.scenes.retrieval.index_writer import Content, Making, write_index
+from mapless_server.scenes.retrieval.index_writer import Content, Making, unfinished, write_index
 from mapless_server.scenes.retrieval.lists import ListOptions
 from mapless_server.scenes.retrieval.narrowing import Narrowing, Sphere
 from mapless_server.scenes.retrieval.ranking import Selection, rank_references
@@ -109,7 +109,8 @@ def filed(references: Iterable[IndexedReference], generation: int) -> SceneIndex
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / identity.file_name()
         making = Making(ListOptions(rows_per_list=4))
-        write_index(path, Content(identity, generation, "", [tuple(references)]), making)
+        with unfinished(path) as file:
+            write_index(path, file, Content(identity, generation, "", [tuple(references)]), making)
         return SceneIndex(DIMENSION, IndexFile(path, identity))
 
 

@@ -11,10 +11,11 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import BinaryIO, TypeVar
 
 from mapless_server.bounds import check_bounds
 from mapless_server.errors import NotFound, RequestError
@@ -25,7 +26,7 @@ from mapless_server.store.portions import IndexReader
 from .observer import BackgroundObserver
 from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 from .retrieval.index_file import Header, Identity, IndexDamaged, IndexFile, NotThisIndex
-from .retrieval.index_writer import BeingMade, Content, Making, has_room, write_index
+from .retrieval.index_writer import BeingMade, Content, Making, has_room, unfinished, write_index
 from .retrieval.lists import ListOptions
 
 T = TypeVar("T")
@@ -143,20 +144,8 @@ class IndexFiles:
 
         NotFound if there is no such scene; BeingMade while another server writes the file; OSError if there is no room.
         """
-        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        state = self._reader.read_state(scene_key)
-        if not has_room(self._folder, state.reference_count, self._descriptor.dimension):
-            raise OSError(f"the disk of {self._folder} has too little room")
-        damaged_ids = set[str]()
-        self._step_begin_s = time.monotonic()
-        content = Content(
-            self._identity_of(scene_key, state.create_time_us),
-            state.generation,
-            state.last_change,
-            self._portions(scene_key, damaged_ids),
-            damaged_ids,
-        )
-        write_index(self._path(scene_key), content, Making(self.options.lists, self._pause))
+        with self._unfinished(scene_key) as file:
+            self._write(scene_key, file)
 
     def consider(self, scene_key: SceneKey, entries: Entries, adopt: Callable[[SceneIndex], None]) -> None:
         """Has a scene's file made if it needs one, or another one; `adopt` then gets its index, in the thread."""
@@ -252,16 +241,38 @@ class IndexFiles:
         self._rests_until_s[scene_key] = time.monotonic() + self.options.retry_s
 
     def _make(self, scene_key: SceneKey, adopt: Callable[[SceneIndex], None]) -> None:
-        opened = self.open(scene_key)  # maybe one that another server has made
-        if opened is None or self._is_due(opened[0].entries()):
-            begin_s, cpu_begin_s = time.monotonic(), time.thread_time()
-            self.write(scene_key)
-            took_s, cpu_s = time.monotonic() - begin_s, time.thread_time() - cpu_begin_s
-            self._observer.count("background_cpu_seconds", cpu_s)
-            log.info("the index file of scene %s was made in %.0f s, %.0f of them computing", scene_key, took_s, cpu_s)
-            opened = self.open(scene_key)
+        with self._unfinished(scene_key) as file:
+            opened = self.open(scene_key)  # maybe one that another server has made
+            if opened is None or self._is_due(opened[0].entries()):
+                begin_s, cpu_begin_s = time.monotonic(), time.thread_time()
+                self._write(scene_key, file)
+                took_s, cpu_s = time.monotonic() - begin_s, time.thread_time() - cpu_begin_s
+                self._observer.count("background_cpu_seconds", cpu_s)
+                log.info(
+                    "the index file of scene %s was made in %.0f s, %.0f of them computing", scene_key, took_s, cpu_s
+                )
+                opened = self.open(scene_key)
         if opened is not None:
             adopt(opened[0])
+
+    def _unfinished(self, scene_key: SceneKey) -> AbstractContextManager[BinaryIO]:
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        return unfinished(self._path(scene_key))
+
+    def _write(self, scene_key: SceneKey, file: BinaryIO) -> None:
+        state = self._reader.read_state(scene_key)
+        if not has_room(self._folder, state.reference_count, self._descriptor.dimension):
+            raise OSError(f"the disk of {self._folder} has too little room")
+        damaged_ids = set[str]()
+        self._step_begin_s = time.monotonic()
+        content = Content(
+            self._identity_of(scene_key, state.create_time_us),
+            state.generation,
+            state.last_change,
+            self._portions(scene_key, damaged_ids),
+            damaged_ids,
+        )
+        write_index(self._path(scene_key), file, content, Making(self.options.lists, self._pause))
 
     def _portions(self, scene_key: SceneKey, damaged_ids: set[str]) -> Iterator[tuple[IndexedReference, ...]]:
         read = partial(self._reader.read_portion, scene_key, count=_PORTION, descriptor_name=self._descriptor.name)

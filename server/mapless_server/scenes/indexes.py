@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -59,7 +59,7 @@ class SceneIndexes:
         self._lock = threading.Lock()
 
     def extents_m(self, scenes: Sequence[GroupedScene]) -> Array:
-        """Distances (N,) of the furthest references of scenes from the origins of their worlds.
+        """Distances (N,), at least, of the furthest references of scenes from the origins of their worlds.
 
         Infinite where it is not known as of the scene's generation.
         """
@@ -237,7 +237,7 @@ class SceneIndexes:
 
     def _refresh(self, scene_key: SceneKey, cached: _CachedIndex) -> Entries:
         try:
-            entries = cached.refresh(self._store, scene_key, self._descriptor.name)
+            entries = cached.refresh(self._store, scene_key, self._descriptor.name, self._files)
         except Exception:
             # An index that cannot be updated is not valid, and that of a deleted scene wastes memory.
             self._discard_damaged(scene_key, cached)
@@ -249,8 +249,7 @@ class SceneIndexes:
                 self._cached.put(scene_key, cached, cached.index.size_bytes)
         before = self._extents.get(scene_key)
         if before is None or before[0] != entries.generation:
-            distances_m = np.linalg.norm(entries.centres(entries.rows()), axis=1)
-            self._extents.put(scene_key, (entries.generation, float(distances_m.max(initial=0.0))), 1)
+            self._extents.put(scene_key, (entries.generation, entries.extent_m()), 1)
         return entries
 
     def _consider(self, scene_key: SceneKey, cached: _CachedIndex) -> None:
@@ -270,12 +269,11 @@ class SceneIndexes:
             return cached
         if cached is not None:
             self._discard_damaged(scene_key, cached)
-        opened = None if self._files is None else self._files.open(scene_key) or self._files.read(scene_key)
         with self._lock:
             found = self._cached.get(scene_key)
             if found is not None and found is not cached:  # another thread was faster
                 return found
-            new = _CachedIndex(*(opened or (SceneIndex(self._descriptor.dimension), ())))
+            new = _CachedIndex(SceneIndex(self._descriptor.dimension))
             self._cached.put(scene_key, new, 0)
             return new
 
@@ -287,9 +285,9 @@ class _CachedIndex:
     keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged.
     """
 
-    def __init__(self, index: SceneIndex, damaged_ids: Iterable[str] = ()) -> None:
+    def __init__(self, index: SceneIndex) -> None:
         self.index = index
-        self.damaged_ids = set(damaged_ids)
+        self.damaged_ids: set[str] = set()
         self.undescribable: set[str] = set()
         self.reported_ids: set[str] = set()
         self.updating = threading.Lock()
@@ -308,12 +306,21 @@ class _CachedIndex:
             self.damaged_ids.update(changes.damaged)
             self.index = index
 
+    def _read_large(self, scene_key: SceneKey, files: IndexFiles) -> None:
+        """Begins with the file of a large scene or, without one, with what can be read of it in portions."""
+        read = files.open(scene_key) or files.read(scene_key)
+        if read is not None:
+            self.index, damaged_ids = read
+            self.damaged_ids = set(damaged_ids)
+
     def describable(self, entries: Entries) -> list[tuple[str, str]]:
         """Id and key of the entries that have no descriptor but may get one."""
         return [(reference_id, key) for reference_id, key in entries.undescribed() if key not in self.undescribable]
 
-    def refresh(self, store: Store, scene_key: SceneKey, descriptor: str) -> Entries:
+    def refresh(self, store: Store, scene_key: SceneKey, descriptor: str, files: IndexFiles | None) -> Entries:
         with self.updating:
+            if files is not None and self.index.generation < 0:
+                self._read_large(scene_key, files)
             since = self.index.generation
             changes = store.list_changes(scene_key, since if since >= 0 else None, descriptor)
             for reference_id in changes.damaged:

@@ -172,6 +172,12 @@ class Entries:
         """Optical axes (N, 3), unit length, world."""
         return self._viewpoints(rows, 2, slice(3, 6))
 
+    def extent_m(self) -> float:
+        """Distance of the furthest reference from the world's origin; with a file, maybe that of a deleted one."""
+        rows = np.flatnonzero(self._alive[self._first :]) + self._first
+        in_table = float(np.linalg.norm(self.centres(rows), axis=1).max(initial=0.0))
+        return in_table if self.file is None else max(in_table, self.file.header.extent_m)
+
     def reference(self, row: int) -> tuple[str, str, RigidTransform]:
         """Id, key and world_from_camera of a row."""
         in_table = row - self._first
@@ -195,11 +201,15 @@ class Entries:
 
     def _viewpoints(self, rows: Rows, column: int, in_file: slice) -> Array:
         in_table = rows - self._first
-        if self.file is None:
+        if self.file is None or (in_table >= 0).all():
             return self._table.poses[in_table, :, column]
-        found, is_filed = np.empty((len(rows), 3)), in_table < 0
-        found[is_filed] = self.file.viewpoints[rows[is_filed], in_file]
-        found[~is_filed] = self._table.poses[in_table[~is_filed], :, column]
+        filed = np.flatnonzero(in_table < 0)
+        if len(filed) == len(rows):
+            return self.file.viewpoints[rows, in_file]
+        found = np.empty((len(rows), 3))
+        found[filed] = self.file.viewpoints[rows[filed], in_file]
+        others = np.flatnonzero(in_table >= 0)
+        found[others] = self._table.poses[in_table[others], :, column]
         return found
 
     def _row_of_key(self, key: str) -> int | None:

@@ -108,6 +108,7 @@ class Header:
         generation: generation of the scene that is in the file; some later changes may be in it, too.
         last_change: key of the reference that was added or deleted last until then, see `IndexState`.
         count: N, number of rows.
+        extent_m: distance of the furthest camera from the world's origin.
         parts: by name.
     """
 
@@ -115,6 +116,7 @@ class Header:
     generation: int
     last_change: str
     count: int
+    extent_m: float
     parts: Mapping[str, Part]
 
     def encode(self) -> bytes:

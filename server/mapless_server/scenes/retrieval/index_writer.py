@@ -68,16 +68,10 @@ class Content:
     damaged_ids: Collection[str] = ()
 
 
-def write_index(path: Path, content: Content, making: Making | None = None) -> None:
-    """Writes an index file, in a folder that exists.
-
-    A file of that name is replaced when the new one is complete. BeingMade while another process writes it; OSError if
-    it cannot be written; the file of that name then stays as it was.
-    """
+def write_index(path: Path, file: BinaryIO, content: Content, making: Making | None = None) -> None:
+    """Writes an index to an unfinished file, which then replaces that of the path; OSError if it cannot be written."""
     making = making or Making()
     with ExitStack() as stack:
-        unfinished = path.with_suffix(".part")
-        file = stack.enter_context(_locked(unfinished))
         rows, records = (stack.enter_context(tempfile.TemporaryFile(dir=path.parent)) for _ in range(2))
         spooled = _Spooled(content.identity.dimension, rows, records)
         for portion in content.portions:
@@ -86,9 +80,9 @@ def write_index(path: Path, content: Content, making: Making | None = None) -> N
         rows.flush()
         records.flush()
         _write(file, content, spooled, making)
-        file.flush()
-        os.fsync(file.fileno())
-        os.replace(unfinished, path)
+    file.flush()
+    os.fsync(file.fileno())
+    os.replace(_unfinished(path), path)
     _sync_folder(path.parent)
 
 
@@ -98,8 +92,12 @@ def has_room(folder: Path, count: int, dimension: int) -> bool:
 
 
 @contextmanager
-def _locked(path: Path) -> Iterator[BinaryIO]:
-    """The empty file of this name, which only this process has; deleted at the end unless it was renamed."""
+def unfinished(path: Path) -> Iterator[BinaryIO]:
+    """An empty file for the index of a path, which one process has at a time; deleted at the end unless it is finished.
+
+    BeingMade while another process has it; OSError if the folder is missing or cannot be written.
+    """
+    path = _unfinished(path)
     with open(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "r+b") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -114,6 +112,10 @@ def _locked(path: Path) -> Iterator[BinaryIO]:
         finally:
             if path.exists() and path.stat().st_ino == inode:
                 path.unlink()
+
+
+def _unfinished(path: Path) -> Path:
+    return path.with_suffix(".part")
 
 
 @dataclass(eq=False)
@@ -171,7 +173,8 @@ def _write(file: BinaryIO, content: Content, spooled: _Spooled, making: Making) 
     checks = list[int]()
     writer.add("rows", _rows(spooled, order, checks, making.pause))
     writer.add("checks", [np.array(checks, np.uint32).tobytes()])
-    writer.add("viewpoints", [np.concatenate(spooled.viewpoints)[order].tobytes()])
+    viewpoints = np.concatenate(spooled.viewpoints)[order]
+    writer.add("viewpoints", [viewpoints.tobytes()])
     for name, hashes in (("id", spooled.id_hashes), ("key", spooled.key_hashes)):
         ordered = np.concatenate(hashes)[order]
         by_hash = np.argsort(ordered, kind="stable")
@@ -181,7 +184,8 @@ def _write(file: BinaryIO, content: Content, spooled: _Spooled, making: Making) 
     writer.add("records", _records(spooled, sizes, order, making.pause))
     writer.add("damaged", ["\n".join(sorted(content.damaged_ids)).encode()])
     file.seek(0)
-    header = Header(content.identity, content.generation, content.last_change, len(sizes), writer.parts)
+    extent_m = float(np.linalg.norm(viewpoints[:, :3], axis=1).max())
+    header = Header(content.identity, content.generation, content.last_change, len(sizes), extent_m, writer.parts)
     file.write(header.encode())
 
 
