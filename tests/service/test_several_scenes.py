@@ -208,13 +208,17 @@ def test_watchers_see_answers_of_their_scene_and_nothing_of_others(client: Clien
         assert not [it for it in ("twin", "yard", "doll") if it in str(answer)]
 
 
-def test_the_log_names_the_scene_that_was_found(client: Client, caplog: pytest.LogCaptureFixture) -> None:
+def test_log_and_metrics_have_what_was_searched_and_found(
+    client: Client, server: RunningServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = server.value("mapless_searched_scenes_sum")
     with caplog.at_level(logging.INFO):
         found(client, group=SITE_A)
         wait_until(lambda: any("Localize OK" in it.getMessage() for it in caplog.records))
     (line,) = [it for it in caplog.records if it.getMessage() == "Localize OK"]
     fields = vars(line)["fields"]
     assert (fields["scene"], fields["scenes"], fields["searched_scenes"]) == ("hall", 3, 3)
+    assert server.value("mapless_searched_scenes_sum") == before + 3
 
 
 GEO = Priors(geo_position=GeoPositionPrior(47.0, 8.0, 5.0))

@@ -36,6 +36,7 @@ from .buckets import (
     PIXEL_BUCKETS,
     RADIUS_BUCKETS,
     RATIO_BUCKETS,
+    SCENE_BUCKETS,
     STAGE_BUCKETS,
     WAIT_BUCKETS,
 )
@@ -205,6 +206,10 @@ class Metrics(Observer, BackgroundObserver):
         """A query has a pose prior that may say which references are near; whether these sufficed."""
         self._tracking("tracked" if suffices else "searched").inc()
 
+    def searched(self, scene_count: int) -> None:
+        """A photograph was looked for in so many scenes, several."""
+        self._scenes.observe(scene_count)
+
     def attempted(self, rung: str, outcome: str) -> None:
         """An attempt at an answered query's pose ended."""
         self._attempts(rung, outcome).inc()
@@ -347,17 +352,15 @@ class Metrics(Observer, BackgroundObserver):
         self._tracking = Children(tracking, [("tracked",), ("searched",)])
         text = "Time from arrival to a first answer that a better one may follow."
         self._early_answer = histogram("mapless_early_answer_seconds", text, CALL_BUCKETS)
+        self._scenes = histogram("mapless_searched_scenes", "Scenes of a query among several.", SCENE_BUCKETS)
         self._inliers = histogram("mapless_inliers", "2D-3D matches that agree with a pose.", INLIER_BUCKETS)
         self._inlier_ratio = histogram("mapless_inlier_ratio", "Inliers of all 2D-3D matches.", RATIO_BUCKETS)
-        self._reprojection_error = histogram(
-            "mapless_reprojection_error_px", "Median reprojection error of the inliers.", PIXEL_BUCKETS
-        )
-        self._scale_deviation = histogram(
-            "mapless_scale_deviation", "Relative deviation of the scaled trajectory.", DEVIATION_BUCKETS
-        )
-        self._accuracy_radius = histogram(
-            "mapless_accuracy_radius_metres", "Reported radius that holds 68 % of positions, metres.", RADIUS_BUCKETS
-        )
+        text = "Median reprojection error of the inliers."
+        self._reprojection_error = histogram("mapless_reprojection_error_px", text, PIXEL_BUCKETS)
+        text = "Relative deviation of the scaled trajectory."
+        self._scale_deviation = histogram("mapless_scale_deviation", text, DEVIATION_BUCKETS)
+        text = "Reported radius that holds 68 % of positions, metres."
+        self._accuracy_radius = histogram("mapless_accuracy_radius_metres", text, RADIUS_BUCKETS)
 
     def _make_server_metrics(self) -> None:
         counter, gauge, histogram = self._counter, self._gauge, self._histogram

@@ -297,6 +297,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._engine().answered(call.caller, not isinstance(outcome, Rejection))
         for result in results:
             self._metrics.stages(result.stage_seconds)
+            if result.searched_scene_count > 1:
+                self._metrics.searched(result.searched_scene_count)
             if TRACK in result.stage_seconds:
                 self._metrics.tracked(result.is_tracked)
         if isinstance(outcome, Rejection):
