@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta, timezone
+from functools import partial
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from support.servers import listening
 
-from mapless import AdoptionPolicy, Client, Rejected
+from mapless import AdoptionPolicy, Client, NewReference, Rejected
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Refusal
 from mapless_server.security import SceneKey
 from mapless_server.serve.adoption import adopter as module
@@ -198,3 +199,25 @@ def test_a_place_with_too_little_survey_left_is_named(held: Held) -> None:
     (retired,) = held.store.list_retirements(ROOM, held.adopted).values()
     assert retired.reason is RetirementReason.SURVEY_OUTDATED
     assert any("survey these places again" in it for it in held.client.get_scene("room").warnings)
+
+
+def test_a_contradicted_reference_is_retired_and_restored(held: Held) -> None:
+    """It stands where a photograph was taken, and shows something else than the photograph."""
+    query, now = held.place.queries[0], datetime.now(timezone.utc)
+    other = held.place.queries[6]
+    changed = NewReference("changed", other.data, query.camera, query.world_from_camera)
+    held.client.add_reference("room", changed)
+    candidate = held.candidate(query)
+    held.adopter._options = AdoptionOptions(contradictions=2)
+    try:
+        for hour in range(2):
+            assert list(held.client.list_references("room", only_retired=True)) == []
+            held.adopter._now = partial(now.__add__, timedelta(hours=hour))
+            held.consider(candidate)
+    finally:
+        held.adopter._now, held.adopter._options = lambda: datetime.now(timezone.utc), None
+    (retired,) = held.client.list_references("room", only_retired=True)
+    assert retired.reference_id == "changed"
+    assert "do not show what it shows" in retired.retirement
+    held.client.restore_reference("room", "changed")
+    assert list(held.client.list_references("room", only_retired=True)) == []

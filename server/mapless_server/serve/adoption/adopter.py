@@ -205,12 +205,14 @@ class Adopter:
             return self._counted(rules.Refusal.CHANGED)
         result = await self._localized(candidate.query, place, candidate.query.photo.mask)
         surveyed = self._evidence(candidate.query, result)
-        await self._learn(candidate, place, surveyed, result, policy, options)
+        await self._learn(candidate, place, surveyed, policy, options)
         refused = rules.refusal(policy, candidate.answered, surveyed, options)
         if refused is None and surveyed is not None:
             refused = await self._refusal_by_pixels(candidate, place, surveyed, result, options)
         if refused is None and surveyed is not None:
-            refused = await self._adopt(candidate, place, surveyed, result, policy, options)
+            refused = await self._adopt(candidate, place, surveyed, policy, options)
+        if surveyed is not None and rules.is_certain(policy, surveyed):
+            await self._count_contradictions(scene_key, place, surveyed, result, options)
         return self._counted(refused)
 
     def _counted(self, refused: Refusal | None) -> Refusal | None:
@@ -284,25 +286,19 @@ class Adopter:
         candidate: Candidate,
         place: Place,
         surveyed: Evidence | None,
-        result: Result,
         policy: AdoptionPolicy,
         options: AdoptionOptions,
     ) -> None:
-        """Counts what a photograph says of its place, of adopted references, and of those that should show the same."""
-        database, answered, now_us = self._store.database, candidate.answered, time_us(self._now())
+        """Counts what a photograph says of its place, and of the adopted references there."""
+        database, answered, scene_key = self._store.database, candidate.answered, candidate.query.scene_key
         share = rules.surveyed_share(answered, surveyed)
         made = await asyncio.to_thread(
             adoption.change_standings, database, [place.key], lambda _, it: rules.with_share(it, share, options)
         )
         here = [it for it in await self._adopted(candidate) if it.place_key == place.key and not it.is_retired]
         if any(rules.is_outdated(it, policy, options) for it in made.values()):
-            retired = await self._retire(
-                candidate.query.scene_key, [it.key for it in here], RetirementReason.SURVEY_OUTDATED
-            )
-            if retired:
-                log.warning(
-                    "scene %s: the place of %s needs a new survey", candidate.query.scene_key, place.reference_id
-                )
+            if await self._retire(scene_key, [it.key for it in here], RetirementReason.SURVEY_OUTDATED):
+                log.warning("scene %s: the place of %s needs a new survey", scene_key, place.reference_id)
             return
         total = max(answered.inlier_count, 1)
         useful = {
@@ -310,24 +306,26 @@ class Adopter:
             for it in here
         }
         await asyncio.to_thread(adoption.set_usefulness, database, useful)
-        if surveyed is not None and rules.is_certain(policy, surveyed):
-            shares = self._shares(candidate, place, surveyed, result, options)
-            standings = await asyncio.to_thread(
-                adoption.change_standings,
-                database,
-                shares,
-                lambda key, it: rules.with_photograph(it, shares[key], now_us, options),
-            )
-            contradicted = [key for key, it in standings.items() if it.contradiction_count >= options.contradictions]
-            await self._retire(candidate.query.scene_key, contradicted, RetirementReason.CONTRADICTED)
+
+    async def _count_contradictions(
+        self, scene_key: SceneKey, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
+    ) -> None:
+        """Counts what a photograph says of the surveyed references that should show what it shows, and retires some."""
+        now_us, shares = time_us(self._now()), self._shares(place, surveyed, result, options)
+        standings = await asyncio.to_thread(
+            adoption.change_standings,
+            self._store.database,
+            shares,
+            lambda key, it: rules.with_photograph(it, shares[key], now_us, options),
+        )
+        contradicted = [key for key, it in standings.items() if it.contradiction_count >= options.contradictions]
+        await self._retire(scene_key, contradicted, RetirementReason.CONTRADICTED)
 
     async def _adopted(self, candidate: Candidate) -> list[Adopted]:
         return await asyncio.to_thread(adoption.list_adopted, self._store.database, candidate.query.scene_key)
 
     @staticmethod
-    def _shares(
-        candidate: Candidate, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
-    ) -> dict[str, float]:
+    def _shares(place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions) -> dict[str, float]:
         """Share of a photograph's matches with each reference that should show what it shows, by key."""
         pose = surveyed.world_from_camera
         chosen = rules.should_show(place.centres, place.axes, pose, distance_shown(result), options)
@@ -340,7 +338,6 @@ class Adopter:
         candidate: Candidate,
         place: Place,
         surveyed: Evidence,
-        result: Result,
         policy: AdoptionPolicy,
         options: AdoptionOptions,
     ) -> Refusal | None:
