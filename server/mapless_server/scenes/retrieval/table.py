@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-SMALLEST_CAPACITY = 64
+SMALLEST_CAPACITY = 8
+"""Rows of the smallest table: a group may be of thousands of scenes with a few references."""
 _GROWTH = 1.5
 
 
