@@ -15,7 +15,7 @@ PROTO_VENV  := $(VENV)/proto-tools
 # processes compiles all that it imports: a server takes 3.0 s of processor time to start instead of 1.3.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup lock test nightly weights lint format proto released demo demo-video bench bench-turns bench-gpu evidence load load-ray fuzz \
+.PHONY: help setup lock test nightly weights lint format proto released demo demo-video bench bench-turns bench-gpu bench-retrieval evidence load load-ray fuzz \
     sbom release-images release-image reference docs clean
 
 help:  ## List the targets
@@ -106,6 +106,9 @@ bench-turns: setup  ## Compare two commits by turns in one run: BEFORE=commit AF
 
 bench-gpu: setup  ## Measure the networks and whole queries on a CUDA device; without one, what a CPU can measure
 	$(FROM_HERE) $(BIN)/python -m bench.network $(ARGS)
+
+bench-retrieval: setup  ## Measure retrieval in a scene of a million references: an hour, 5 GB; DATA=folder with the scenes
+	$(FROM_HERE) $(BIN)/python -m bench.retrieval --data $(if $(DATA),'$(DATA)',../shared/data) $(ARGS)
 
 evidence: setup  ## Measure a constant again and write its page; KEY=..., without it the keys; DATA=folder with the scenes
 	$(FROM_HERE) $(BIN)/python -m research.evidence $(KEY) $(if $(DATA),'$(DATA)') $(ARGS)

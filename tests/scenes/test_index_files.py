@@ -6,10 +6,12 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +34,7 @@ from mapless_server.scenes.retrieval.lists import ListOptions
 from mapless_server.scenes.retrieval.ranking import Selection, rank_references
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
-from mapless_server.store.portions import IndexReader
+from mapless_server.store.portions import IndexedPortion, IndexReader
 
 SCENE = SceneKey("s")
 EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
@@ -198,6 +200,32 @@ class TestUse:
         indexes = serve()
         assert "r9" not in indexes.filed()
         assert [indexes.of_scenes.is_damaged(SCENE, it) for it in ("r8", "r9")] == [False, True]
+
+    def test_reading_a_scene_without_one_goes_on_when_a_call_ends(
+        self, serve: Serve, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        read, go_on, begun = IndexReader.read_portion, threading.Event(), list[str]()
+
+        def read_slowly(self: IndexReader, scene_key: SceneKey, after_id: str, **more: Any) -> IndexedPortion:
+            if not after_id:
+                begun.append(scene_key)
+            go_on.wait()
+            return read(self, scene_key, after_id, **more)
+
+        def is_cancelled() -> None:
+            if begun:
+                raise TimeoutError("cancelled")
+
+        monkeypatch.setattr(IndexReader, "read_portion", read_slowly)
+        indexes = serve()
+        for _ in range(2):
+            with pytest.raises(TimeoutError, match="cancelled"):
+                indexes.of_scenes.entries(SCENE, StageContext(is_cancelled))
+        assert begun == [SCENE]
+        go_on.set()
+        assert len(indexes.entries()) == 60
+        assert len(indexes.filed()) == 60
+        assert begun == [SCENE] * 2
 
 
 class TestDistrust:

@@ -30,7 +30,7 @@ def main(
     work: Annotated[
         Path | None, typer.Option(help="Folder for stores, about 5 KB a reference; else a temporary one.")
     ] = None,
-    output: Annotated[Path, typer.Option(help="File for the figures.")] = Path("retrieval-output/retrieval.json"),
+    output: Annotated[Path, typer.Option(help="File for the figures.")] = Path("bench-output/retrieval.json"),
 ) -> None:
     """Measures retrieval in a scene of so many references."""
     figures = {}

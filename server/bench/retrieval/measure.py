@@ -20,6 +20,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.scenes.index_files import IndexFiles
 from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
+from mapless_server.scenes.retrieval.lists import likely_rows
 from mapless_server.scenes.retrieval.narrowing import Narrowing, Sphere
 from mapless_server.scenes.retrieval.quantizing import Vector
 from mapless_server.scenes.retrieval.ranking import Selection, rank_references
@@ -30,6 +31,7 @@ from .vectors import Floats
 
 INDEXES = "indexes"
 COLD_QUERIES = 20
+COMPARED = (5_000, 10_000, 20_000, 50_000)
 CHANGES = 20
 RADIUS_M = 15.0
 
@@ -55,6 +57,7 @@ class Served:
         p50_ms, p99_ms, p50_cpu_ms: of all later ones; the last is processor time, which other programs do not change.
         near_p50_ms: median with a prior that leaves a radius of 15 m.
         recall: share of the ten that an exact search finds first.
+        recall_by_rows: the same, if so many rows at least were compared, and no more lists than that takes.
         bytes_per_reference: memory after all queries, beyond what the process had.
         found_ms: median time from the return of the call that adds a reference until it has been found by a query.
         not_found, still_found: how many new references were not found first, and how many deleted ones were found.
@@ -69,6 +72,7 @@ class Served:
     p50_cpu_ms: float
     near_p50_ms: float
     recall: float
+    recall_by_rows: dict[int, float]
     bytes_per_reference: float
     found_ms: float
     not_found: int
@@ -128,7 +132,7 @@ def serve(folder: Path, queries: Floats, best: NDArray[np.intp], query_count: in
         anywhere = Narrowing()
         cold = [ask(query, anywhere)[1] for query in queries[:COLD_QUERIES]]
         times = np.array([ask(queries[i % len(queries)], anywhere)[1:] for i in range(query_count)])
-        recall = _recall(indexes, queries, best)
+        recall, *recalls = (_recall(indexes, queries, best, it) for it in (None, *COMPARED))
         random = np.random.default_rng(0)
         positions = np.column_stack([random.uniform(0, SIDE_M, (100, 2)), np.zeros(100)])
         near = [Narrowing(position=Sphere(it, RADIUS_M)) for it in positions]
@@ -154,6 +158,7 @@ def serve(folder: Path, queries: Floats, best: NDArray[np.intp], query_count: in
         p50_cpu_ms=float(np.percentile(times[:, 1], 50)),
         near_p50_ms=float(np.median(near_times)),
         recall=recall,
+        recall_by_rows=dict(zip(COMPARED, recalls, strict=True)),
         bytes_per_reference=bytes_per_reference,
         found_ms=float(np.median(found_ms)),
         not_found=not_found,
@@ -161,13 +166,18 @@ def serve(folder: Path, queries: Floats, best: NDArray[np.intp], query_count: in
     )
 
 
-def _recall(indexes: SceneIndexes, queries: Floats, best: NDArray[np.intp]) -> float:
-    """Share of the references in `best` (Q, 10) among the ten most similar that the search compares."""
+def _recall(indexes: SceneIndexes, queries: Floats, best: NDArray[np.intp], compared: int | None) -> float:
+    """Share of the references in `best` (Q, 10) among the ten first of the search, or of so many rows."""
     entries, right = indexes.entries(SCENE, StageContext()), 0
-    rows = entries.rows()
+    every = entries.rows()
     for query, expected in zip(queries, best, strict=True):
-        similar = entries.similar(query, rows, BEST)
-        first = similar.rows[np.argsort(-similar.similarity, kind="stable")[:BEST]]
+        if compared is None or entries.file is None:
+            similar = entries.similar(query, every, BEST)
+            rows, similarity = similar.rows, similar.similarity
+        else:
+            rows, _ = likely_rows(every, query, entries.file, compared)
+            similarity = entries.similarities(query, rows)
+        first = rows[np.argsort(-similarity, kind="stable")[:BEST]]
         right += len({number_of(entries.reference(int(row))[0]) for row in first} & {*expected.tolist()})
     return right / best.size
 

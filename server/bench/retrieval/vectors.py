@@ -23,6 +23,7 @@ Floats = NDArray[np.float32]
 
 BLOCK = 10_000
 """References that are made at a time."""
+QUERIED_BLOCKS = 10
 VIEWS = 500
 """References at a planted place."""
 PLACE_SHARE = 0.6
@@ -77,7 +78,7 @@ def planted(count: int, seed: int) -> Vectors:
         return np.concatenate([views for views, _ in places]), np.array([query for _, query in places])
 
     firsts = range(0, count, BLOCK)
-    some = np.unique(np.linspace(0, len(firsts) - 1, min(len(firsts), 25)).round().astype(int))
+    some = np.unique(np.linspace(0, len(firsts) - 1, min(len(firsts), QUERIED_BLOCKS)).round().astype(int))
     queries = np.concatenate([block(firsts[i])[1] for i in some])
     return Vectors("planted places", queries, lambda: (block(first)[0] for first in firsts))
 

@@ -1,4 +1,4 @@
-"""The index files of large scenes: made in a thread of its own, opened where they are those of the store's scene.
+"""The index files of large scenes: made in a thread of their own, opened where they are those of the store's scene.
 
 A server needs none: without a file a scene is read into memory and searched exactly. So a file that is damaged, of
 another version or of another scene is not used, and what cannot be made is tried again later.
@@ -11,6 +11,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
@@ -30,6 +31,9 @@ from .retrieval.index_writer import BeingMade, Content, Making, has_room, unfini
 from .retrieval.lists import ListOptions
 
 T = TypeVar("T")
+
+Read = tuple[SceneIndex, Collection[str]]
+"""An index, and the ids of references that are left out because they are damaged in the store."""
 
 log = logging.getLogger(__name__)
 
@@ -101,15 +105,13 @@ class IndexFiles:
         self._wanted: queue.SimpleQueue[tuple[SceneKey, Callable[[SceneIndex], None]] | None] = queue.SimpleQueue()
         self._waiting: set[SceneKey] = set()
         self._rests_until_s: dict[SceneKey, float] = {}
+        self._readers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="large scenes")
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._step_begin_s = 0.0
 
-    def open(self, scene_key: SceneKey) -> tuple[SceneIndex, Collection[str]] | None:
-        """Opens the index of a scene, as it is in the store; None if there is no file that is certainly of it.
-
-        With the ids of references that are left out because they are damaged in the store.
-        """
+    def open(self, scene_key: SceneKey) -> Read | None:
+        """Opens the index of a scene, as it is in the store; None if there is no file that is certainly of it."""
         path = self._path(scene_key)
         if not path.exists():  # as for most scenes: the store need not be asked
             return None
@@ -123,20 +125,31 @@ class IndexFiles:
                 path.unlink(missing_ok=True)
             return None
 
-    def read(self, scene_key: SceneKey) -> tuple[SceneIndex, Collection[str]] | None:
-        """Reads a large scene into memory, in portions, which takes less of it than all at once; None if it is small.
-
-        As it was at a generation, with the ids of references that are left out because they are damaged.
-        """
+    def is_large(self, scene_key: SceneKey) -> bool:
+        """Whether a scene, which exists, is large enough for a file."""
         try:
-            state = self._reader.read_state(scene_key)
+            return self._reader.read_state(scene_key).reference_count >= self.options.least_references
         except NotFound:
-            return None
-        if state.reference_count < self.options.least_references:
-            return None
+            return False
+
+    def read(self, scene_key: SceneKey) -> Future[Read]:
+        """Reads a large scene into memory, in portions, which takes less memory than all at once, in a thread.
+
+        As it was at a generation. A million references take longer than callers wait; what has been read is not lost
+        when they end. The result raises NotFound if there is no such scene.
+        """
+        return self._readers.submit(self._read, scene_key)
+
+    def _read(self, scene_key: SceneKey) -> Read:
+        begin_s = time.monotonic()
+        state = self._reader.read_state(scene_key)
         index, damaged_ids = SceneIndex(self._descriptor.dimension), set[str]()
         for portion in self._portions(scene_key, damaged_ids):
+            if self._closing.is_set():
+                raise _Closing
             index.apply(SceneChanges(state.generation, portion, frozenset(), False))
+        took_s = time.monotonic() - begin_s
+        log.info("scene %s, which has no index file, was read into memory in %.0f s", scene_key, took_s)
         return index, damaged_ids
 
     def write(self, scene_key: SceneKey) -> None:
@@ -168,6 +181,7 @@ class IndexFiles:
     def close(self) -> None:
         """Ends the thread after its current step; a file that it makes is given up."""
         self._closing.set()
+        self._readers.shutdown(cancel_futures=True)
         self._wanted.put(None)
         if self._thread is not None:
             self._thread.join()
@@ -191,7 +205,7 @@ class IndexFiles:
         name, dimension = self._descriptor.name, self._descriptor.dimension
         return Identity(self._store.database.name, scene_key, create_time_us, name, dimension)
 
-    def _current(self, scene_key: SceneKey, file: IndexFile) -> tuple[SceneIndex, Collection[str]]:
+    def _current(self, scene_key: SceneKey, file: IndexFile) -> Read:
         """The index of a file with what has changed since; NotThisIndex if the store has had another history."""
         index, generation = SceneIndex(self._descriptor.dimension, file), file.header.generation
         damaged_ids = {*file.damaged_ids}

@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future, wait
 from functools import partial
 
 import numpy as np
@@ -20,7 +21,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
 from mapless_server.store import GroupedScene, Store
 
-from .index_files import IndexFiles, again_if_damaged
+from .index_files import IndexFiles, Read, again_if_damaged
 from .library import KeyedLocks, Loaded, ReferenceLibrary, load_usable
 from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 
@@ -29,6 +30,10 @@ log = logging.getLogger(__name__)
 
 REMEMBERED_EXTENTS = 100_000
 """Scenes of which the extent is remembered after their index was evicted, some 20 MB."""
+
+
+_LOOK_S = 0.05
+"""Time between two looks whether a call that waits for a large scene has been cancelled."""
 
 
 class SceneIndexes:
@@ -94,6 +99,8 @@ class SceneIndexes:
     def _current(self, scene_key: SceneKey, context: StageContext, waits: bool) -> Entries:
         # Even if the scene is evicted meanwhile, this call continues with the same index.
         cached = self._get(scene_key)
+        if cached.index.generation < 0 and self._files is not None:
+            self._begin(scene_key, cached, self._files, context)
         while True:
             self._refresh(scene_key, cached)
             self._consider(scene_key, cached)
@@ -237,7 +244,7 @@ class SceneIndexes:
 
     def _refresh(self, scene_key: SceneKey, cached: _CachedIndex) -> Entries:
         try:
-            entries = cached.refresh(self._store, scene_key, self._descriptor.name, self._files)
+            entries = cached.refresh(self._store, scene_key, self._descriptor.name)
         except Exception:
             # An index that cannot be updated is not valid, and that of a deleted scene wastes memory.
             self._discard_damaged(scene_key, cached)
@@ -251,6 +258,22 @@ class SceneIndexes:
         if before is None or before[0] != entries.generation:
             self._extents.put(scene_key, (entries.generation, entries.extent_m()), 1)
         return entries
+
+    def _begin(self, scene_key: SceneKey, cached: _CachedIndex, files: IndexFiles, context: StageContext) -> None:
+        """Begins with a large scene's file or, without one, with what is read of it while this and other calls wait."""
+        opened = files.open(scene_key)
+        if opened is not None:
+            cached.begin(opened)
+        elif files.is_large(scene_key):
+            with self._lock:
+                reading = cached.reading = cached.reading or files.read(scene_key)
+            try:
+                while not wait([reading], _LOOK_S).done:
+                    context.check()
+                cached.begin(reading.result())
+            finally:
+                if reading.done():  # it holds what it has read
+                    cached.reading = None
 
     def _consider(self, scene_key: SceneKey, cached: _CachedIndex) -> None:
         if self._files is not None:
@@ -282,7 +305,8 @@ class _CachedIndex:
     """An index, and the lock `updating` of the thread that updates it.
 
     `damaged_ids` are of references that are not in the index, of which some may have been deleted; `undescribable` are
-    keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged.
+    keys of references found damaged when they were to be described; of `reported_ids` the damage has been logged;
+    `reading` is what calls for a large scene without a file wait for.
     """
 
     def __init__(self, index: SceneIndex) -> None:
@@ -291,6 +315,7 @@ class _CachedIndex:
         self.undescribable: set[str] = set()
         self.reported_ids: set[str] = set()
         self.updating = threading.Lock()
+        self.reading: Future[Read] | None = None
 
     @property
     def is_damaged(self) -> bool:
@@ -306,21 +331,19 @@ class _CachedIndex:
             self.damaged_ids.update(changes.damaged)
             self.index = index
 
-    def _read_large(self, scene_key: SceneKey, files: IndexFiles) -> None:
-        """Begins with the file of a large scene or, without one, with what can be read of it in portions."""
-        read = files.open(scene_key) or files.read(scene_key)
-        if read is not None:
-            self.index, damaged_ids = read
-            self.damaged_ids = set(damaged_ids)
+    def begin(self, read: Read) -> None:
+        """Begins with what was read, unless the index has begun already."""
+        with self.updating:
+            if self.index.generation < 0:
+                self.index, damaged_ids = read
+                self.damaged_ids = set(damaged_ids)
 
     def describable(self, entries: Entries) -> list[tuple[str, str]]:
         """Id and key of the entries that have no descriptor but may get one."""
         return [(reference_id, key) for reference_id, key in entries.undescribed() if key not in self.undescribable]
 
-    def refresh(self, store: Store, scene_key: SceneKey, descriptor: str, files: IndexFiles | None) -> Entries:
+    def refresh(self, store: Store, scene_key: SceneKey, descriptor: str) -> Entries:
         with self.updating:
-            if files is not None and self.index.generation < 0:
-                self._read_large(scene_key, files)
             since = self.index.generation
             changes = store.list_changes(scene_key, since if since >= 0 else None, descriptor)
             for reference_id in changes.damaged:
