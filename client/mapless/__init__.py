@@ -3,7 +3,7 @@
 >>> answer = mapless.localize("photo.jpg", camera)
 
 localizes a photograph with the server of MAPLESS_ADDRESS (default localhost:50051) in the scene of MAPLESS_SCENE
-(default: its only scene), and
+(default: found among all), and
 
 >>> with Client("localhost:50051") as client:
 ...     answer = client.localize("photo.jpg", camera, scene="kitchen")

@@ -214,7 +214,7 @@ class LocalizationResult:
         pose, frame = self.world_from_camera, ""
         if self.in_axes is not None and self.in_axes.axes != "OPENCV":
             pose, frame = self.in_axes.world_from_camera, f"   in {self.in_axes.axes} axes"
-        scene = f" in {_id(self.scene)}" if self.diagnostics.is_among_several else ""
+        scene = f" in {_id(self.scene)}" if self.scene else ""
         text = [f"{_outcome(self, scene)}{frame}", *pose_lines(pose, self.accuracy, self.arbitrary_unit)]
         if self.geo_pose is not None:
             geo = self.geo_pose

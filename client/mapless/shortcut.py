@@ -42,20 +42,18 @@ def localize(
         image: the photograph.
         camera: the camera that took it, in pixels of the file as it is stored, before any EXIF rotation; None if it is
             not known, see `Client.localize`.
-        scene: the scene; None for MAPLESS_SCENE, or else the server's only scene, which costs another call.
+        scene: the scene; None for MAPLESS_SCENE, or else it is found among all (`LocalizationResult.scene`).
         address: "host:port"; None for MAPLESS_ADDRESS, or else localhost:50051.
         options: options of the connection; None for no encryption, with the token of MAPLESS_TOKEN if it is set.
         priors: knowledge of the pose before the photograph is used, for example its position.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: of `LocalizationResult.in_axes`.
         mask: a PNG of the photograph's size that is 0 at the pixels to ignore; None: all are used.
         timeout_s: deadline of the call.
-
-    Raises:
-        ValueError: no scene is given, and the server has none or several.
     """
     client = _client(address or default_address(), options or ConnectOptions(token=os.environ.get(TOKEN_VARIABLE)))
-    scene = scene or os.environ.get(SCENE_VARIABLE) or _only_scene(client, timeout_s)
-    return client.localize(image, camera, scene, priors=priors, axes=axes, mask=mask, timeout_s=timeout_s)
+    scene = scene or os.environ.get(SCENE_VARIABLE) or ""
+    group: dict[str, str] | None = None if scene else {}
+    return client.localize(image, camera, scene, group=group, priors=priors, axes=axes, mask=mask, timeout_s=timeout_s)
 
 
 def default_address() -> str:
@@ -70,14 +68,6 @@ def _client(address: str, options: ConnectOptions) -> Client:
         if key not in _clients:
             _clients[key] = Client(address, options)
         return _clients[key]
-
-
-def _only_scene(client: Client, timeout_s: float | None) -> str:
-    scenes = [scene.scene_id for scene in client.list_scenes(timeout_s=timeout_s)]
-    if len(scenes) != 1:
-        there = f"there are {', '.join(scenes)}" if scenes else "the server has none"
-        raise ValueError(f"name the scene, as an argument or in {SCENE_VARIABLE}: {there}")
-    return scenes[0]
 
 
 @atexit.register

@@ -241,7 +241,8 @@ namespace Mapless
         public Task<LocalizeResponse> LocalizeAsync(
             LocalizeRequest request, TimeSpan timeout, CancellationToken cancellation = default)
         {
-            return CallAsync(LocalizeMethod, request, SceneOf(request), timeout, cancellation);
+            string scene = SceneOf(request.Scene, request.Scenes, request.SceneGroup);
+            return CallAsync(LocalizeMethod, request, scene, timeout, cancellation);
         }
 
         /// <summary>
@@ -260,7 +261,8 @@ namespace Mapless
             while (true)
             {
                 Server server = NextServer();
-                CallOptions options = OptionsOf(SceneOf(request), attempts.Deadline, cancellation);
+                CallOptions options = OptionsOf(
+                    SceneOf(request.Scene, request.Scenes, request.SceneGroup), attempts.Deadline, cancellation);
                 try
                 {
                     using (var call = server.Invoker.AsyncServerStreamingCall(LocalizeProgressivelyMethod, null, options, request))
@@ -294,14 +296,16 @@ namespace Mapless
         public Task<LocalizeRigResponse> LocalizeRigAsync(
             LocalizeRigRequest request, TimeSpan timeout, CancellationToken cancellation = default)
         {
-            return CallAsync(LocalizeRigMethod, request, request.Scene, timeout, cancellation);
+            string scene = SceneOf(request.Scene, request.Scenes, request.SceneGroup);
+            return CallAsync(LocalizeRigMethod, request, scene, timeout, cancellation);
         }
 
         /// <summary>Photographs of a walk, with tracked poses.</summary>
         public Task<LocalizeSequenceResponse> LocalizeSequenceAsync(
             LocalizeSequenceRequest request, TimeSpan timeout, CancellationToken cancellation = default)
         {
-            return CallAsync(LocalizeSequenceMethod, request, request.Scene, timeout, cancellation);
+            string scene = SceneOf(request.Scene, request.Scenes, request.SceneGroup);
+            return CallAsync(LocalizeSequenceMethod, request, scene, timeout, cancellation);
         }
 
         /// <summary>Whether the server takes calls now; false while it starts or drains. Four attempts, in 1.4 s.</summary>
@@ -759,21 +763,21 @@ namespace Mapless
         }
 
         // Of several scenes the first by name, of a group its labels: calls for the same scenes come to one server.
-        private static string SceneOf(LocalizeRequest request)
+        private static string SceneOf(string scene, IEnumerable<string> several, SceneGroup group)
         {
-            if (request.SceneGroup != null)
+            if (group != null)
             {
                 var labels = new List<string>();
-                foreach (var label in new SortedDictionary<string, string>(request.SceneGroup.Labels, StringComparer.Ordinal))
+                foreach (var label in new SortedDictionary<string, string>(group.Labels, StringComparer.Ordinal))
                 {
                     labels.Add(Uri.EscapeDataString(label.Key) + "=" + Uri.EscapeDataString(label.Value).Replace("%20", "+"));
                 }
                 string query = string.Join("&", labels);
                 return query.Length <= 200 ? "scenes?" + query : null;
             }
-            var scenes = new List<string>(request.Scenes);
+            var scenes = new List<string>(several);
             scenes.Sort(StringComparer.Ordinal);
-            return scenes.Count > 0 ? scenes[0] : request.Scene;
+            return scenes.Count > 0 ? scenes[0] : scene;
         }
 
         private static string SceneOf(string reference)

@@ -234,21 +234,21 @@ def photo(tmp_path: Path) -> str:
     return str(tmp_path / "photo.png")
 
 
-def test_one_line_is_enough_where_there_is_one_scene(
-    tmp_path: Path, photo: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_line_is_enough(tmp_path: Path, photo: str, monkeypatch: pytest.MonkeyPatch) -> None:
     with serving(tmp_path / "data") as server, Client(server.address) as client:
         monkeypatch.setenv("MAPLESS_ADDRESS", server.address)
-        with pytest.raises(ValueError, match="the server has none"):
+        with pytest.raises(NotFound, match="there is no scene"):
             mapless.localize(photo, CAMERA)
         make_scene(client, "hall", 2)
-        assert isinstance(mapless.localize(photo, CAMERA), LocalizationResult)
+        near = mapless.Priors(position=mapless.PositionPrior(pose(0.0).translation, 50.0))
+        assert isinstance(mapless.localize(photo, CAMERA, priors=near), LocalizationResult)
         client.create_scene("other")
-        with pytest.raises(ValueError, match="there are hall, other"):
-            mapless.localize(photo, CAMERA)
-        assert isinstance(mapless.localize(photo, CAMERA, "hall"), LocalizationResult)
-        monkeypatch.setenv("MAPLESS_SCENE", "hall")
-        assert isinstance(mapless.localize(photo, CAMERA), LocalizationResult)
+        for scene in (None, "hall"):
+            answer = mapless.localize(photo, CAMERA, scene)
+            assert isinstance(answer, LocalizationResult)
+            assert answer.scene == "scenes/hall"
+        monkeypatch.setenv("MAPLESS_SCENE", "other")
+        assert isinstance(mapless.localize(photo, CAMERA), Rejected)
         shortcut._close()
 
 

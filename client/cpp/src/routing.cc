@@ -41,12 +41,18 @@ std::string GroupOf(const v1::SceneGroup& group) {
 }
 
 std::string NameIn(const google::protobuf::Message& request) {
-  if (const auto* localize = dynamic_cast<const v1::LocalizeRequest*>(&request)) {
-    if (localize->has_scene_group()) return GroupOf(localize->scene_group());
-    const auto& scenes = localize->scenes();
-    if (!scenes.empty()) return *std::min_element(scenes.begin(), scenes.end());
-  }
   const auto* reflection = request.GetReflection();
+  const auto* group = request.GetDescriptor()->FindFieldByName("scene_group");
+  if (group != nullptr && reflection->HasField(request, group))
+    return GroupOf(static_cast<const v1::SceneGroup&>(reflection->GetMessage(request, group)));
+  if (const auto* several = request.GetDescriptor()->FindFieldByName("scenes"); several != nullptr && several->is_repeated()) {
+    std::string first;
+    for (int i = 0; i < reflection->FieldSize(request, several); ++i) {
+      const std::string name = reflection->GetRepeatedString(request, several, i);
+      first = i == 0 ? name : std::min(first, name);
+    }
+    if (!first.empty()) return first;
+  }
   for (const char* name : {"scene", "name", "scene_id"}) {
     const auto* field = request.GetDescriptor()->FindFieldByName(name);
     if (field == nullptr) continue;

@@ -134,6 +134,8 @@ def _prior_scene(
     if not request.prior_scene:
         if not in_world.ListFields():
             return None
+        if len(found.scenes) == 1:
+            return 0
         given = in_world.ListFields()[0][0].name
         raise FieldError("prior_scene", f"is required with {given}: one of several scenes, in whose world it is given")
     key = scene_key_from_name(request.prior_scene, "prior_scene", tenant)
