@@ -95,7 +95,7 @@ def test_the_answer_is_the_one_with_its_scene_named(client: Client, where: dict[
 
 def test_a_group_on_the_earth_has_the_scenes_with_a_datum(client: Client) -> None:
     assert found(client, group={}, with_datum=True).diagnostics.searched_scene_count == 2
-    with pytest.raises(NotFound, match="no scene with 'site=b, a datum'"):
+    with pytest.raises(NotFound, match="no scene with 'site=b' and a datum"):
         client.localize(PHOTO, CAMERA, group={"site": "b"}, with_datum=True)
 
 

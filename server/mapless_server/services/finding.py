@@ -35,10 +35,9 @@ class SceneFinder:
         labels = labels_from_message(request.scene_group.labels, "scene_group.labels")
         found = self._group(labels, request.scene_group.with_datum, principal)
         if not found.scenes:
-            having = [f"{name}={value}" for name, value in labels.items()]
+            having = [names.shown(", ".join(f"{name}={value}" for name, value in labels.items()))] if labels else []
             having += ["a datum"] if request.scene_group.with_datum else []
-            shown = f" with {names.shown(', '.join(having))}" if having else ""
-            raise NotFound(f"there is no scene{shown}", field="scene_group")
+            raise NotFound(f"there is no scene{' with ' * bool(having)}{' and '.join(having)}", field="scene_group")
         return found
 
     def _named(self, request: AnyRequest, principal: Principal) -> FoundScenes:
