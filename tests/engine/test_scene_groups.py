@@ -296,6 +296,13 @@ def test_a_prior_in_a_wrong_scene_gives_the_answer_without_it(rooms: Rooms) -> N
     assert content(found) == content(rooms.ask(image, THERE))
 
 
+def test_a_prior_in_a_scene_that_is_gone_gives_the_answer_without_it(rooms: Rooms) -> None:
+    gone, image = SceneKey("gone"), photograph(TRUE)
+    found = rooms.ask(image, gone, HERE, THERE, priors={gone: pose_prior(TRUE)}, prior_scene=gone)
+    assert [it.outcome for it in found.attempts] == ["failed", "localized"]
+    assert content(found) == content(rooms.ask(image, HERE))
+
+
 @pytest.mark.parametrize("scene", [HERE, THERE])
 def test_gravity_turns_a_photograph_among_scenes_as_in_one(rooms: Rooms, scene: SceneKey) -> None:
     pixels = np.rot90(picture(TRUE, papers=PAPERS_OF[scene]))

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from mapless_server.engine.photo_views import RasterForm
+from mapless_server.engine.photo_views import QueryViews, RasterForm
 from mapless_server.engine.search import Search
 from mapless_server.errors import DataLoss, NotFound, Unavailable
 from mapless_server.method import ladder
@@ -38,6 +38,9 @@ from .scene_group import RankedScene
 from .situation import situation_of
 
 log = logging.getLogger(__name__)
+
+UNREADABLE = NotFound, DataLoss, FeaturesMissing
+"""Errors of a scene that was deleted, is damaged, or has not been described."""
 
 Chosen = tuple[SceneQuestion, Sequence[RankedReference]]
 """A scene, and its references among the most similar of all scenes."""
@@ -73,11 +76,20 @@ def _chosen(search: Search, tier: Tier) -> tuple[Sequence[Chosen], Search]:
         likely = max((it for it in found if it[1]), key=lambda it: it[1][0].similarity, default=None)
         if likely is None or likely[0].priors.gravity is None:
             break
-        turned = choosing.turned_by_gravity(search.but(query=query.in_scene(likely[0])), tier)
-        if turned.views is search.views:
+        views = _turned(search.but(query=query.in_scene(likely[0])), tier)
+        if views is search.views:
             break
-        search = search.but(views=turned.views)
+        search = search.but(views=views)
     return found, search
+
+
+def _turned(search: Search, tier: Tier) -> QueryViews:
+    """The photograph, turned as the references of the search's scene are held, if these can be read."""
+    try:
+        return choosing.turned_by_gravity(search, tier).views
+    except UNREADABLE as error:
+        log.warning("a photograph is not turned as scene %s is held: %s", search.query.scene_key, error)
+        return search.views
 
 
 def _by_matches(search: Search, found: Sequence[Chosen], tier: Tier, compared: Compared) -> tuple[RankedScene, ...]:
@@ -131,7 +143,7 @@ def _loaded(search: Search, chosen: Chosen, tier: Tier) -> tuple[PosedView, ...]
     in_it = search.but(query=search.query.in_scene(question))
     try:
         return choosing.load_chosen(in_it, [it.reference_id for it in references], tier)[1]
-    except (NotFound, DataLoss, FeaturesMissing) as error:
+    except UNREADABLE as error:
         log.warning("scene %s is left out among several: %s", question.scene_key, error)
         return ()
 
