@@ -164,7 +164,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=0, help="of the room and its renovation")
-    parser.add_argument("--photographs", type=int, default=PHOTOGRAPHS, help="of each step, where they are rendered")
+    parser.add_argument("--photographs", type=int, default=PHOTOGRAPHS, help="of each step, the same ones first")
     parser.add_argument("--adopt", action="store_true", help="the scene adopts what is localized")
     arguments = parser.parse_args()
     shares = render(arguments.folder, arguments.seed, arguments.photographs)
@@ -183,7 +183,7 @@ def main() -> None:
         )
         await_features(client, SCENE)
         for step, share in enumerate(shares):
-            frames = read_folder(arguments.folder / f"step-{step:02d}").frames
+            frames = read_folder(arguments.folder / f"step-{step:02d}").frames[: arguments.photographs]
             results.append(measure(client, step, share, frames, metrics))
             print(results[-1].row(results[0]), file=sys.stderr, flush=True)
             if metrics is not None:

@@ -196,6 +196,7 @@ def test_a_place_with_too_little_survey_left_is_named(held: Held) -> None:
     crowded = replace(candidate, answered=replace(candidate.answered, inlier_count=10_000))
     for _ in range(6):
         assert held.consider(crowded) in (Refusal.LITTLE_SURVEYED, Refusal.UNSUPPORTED)
+    assert held.consider(candidate) is Refusal.LITTLE_SURVEYED  # until there is a new survey
     (retired,) = held.store.list_retirements(ROOM, held.adopted).values()
     assert retired.reason is RetirementReason.SURVEY_OUTDATED
     assert any("survey these places again" in it for it in held.client.get_scene("room").warnings)

@@ -36,7 +36,7 @@ from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey
 from mapless_server.services.messages.answers import AnswerFrames, outcome_to_message
 from mapless_server.store import NewReference, RetirementReason, Store, adoption, time_us
-from mapless_server.store.records import Adopted
+from mapless_server.store.records import Adopted, Standing
 
 from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px
 
@@ -150,7 +150,7 @@ class Adopter:
         maintained_s = -MAINTAINED_S
         while True:
             if time.monotonic() - maintained_s >= MAINTAINED_S:
-                await self._guarded(self.maintain())
+                await self._guarded(self.maintain(), "adopted references could not be looked after")
                 maintained_s = time.monotonic()
             if not self._waiting:
                 self._arrived.clear()
@@ -160,17 +160,17 @@ class Adopter:
             await self._until_idle()
             candidate = self._waiting.popleft()
             self._waiting_bytes -= candidate.query.photo.size_bytes
-            await self._guarded(self.consider(candidate))
+            await self._guarded(self.consider(candidate), "a photograph could not be considered as a reference")
 
-    async def _guarded(self, work: Awaitable[object]) -> None:
+    async def _guarded(self, work: Awaitable[object], fault: str) -> None:
         try:
             await work
         except RequestError as error:  # the scene is gone, the store is away, the server ends
             self._observer.count("adoptions", 1, "failed")
-            log.warning("a photograph could not be considered as a reference: %s", error)
+            log.warning("%s: %s", fault, error)
         except Exception as error:
             self._observer.count("adoptions", 1, "failed")
-            log.error("considering a photograph as a reference failed", exc_info=error)
+            log.error("%s", fault, exc_info=error)
 
     async def _until_idle(self) -> None:
         queue, since_s = self._engine.queue, time.monotonic()
@@ -205,8 +205,10 @@ class Adopter:
             return self._counted(rules.Refusal.CHANGED)
         result = await self._localized(candidate.query, place, candidate.query.photo.mask)
         surveyed = self._evidence(candidate.query, result)
-        await self._learn(candidate, place, surveyed, policy, options)
+        is_outdated = await self._learn(candidate, place, surveyed, policy, options)
         refused = rules.refusal(policy, candidate.answered, surveyed, options)
+        if refused is None and is_outdated:
+            refused = rules.Refusal.LITTLE_SURVEYED
         if refused is None and surveyed is not None:
             refused = await self._refusal_by_pixels(candidate, place, surveyed, result, options)
         if refused is None and surveyed is not None:
@@ -225,22 +227,16 @@ class Adopter:
         entries = self._engine.references.retrievals[0].indexes.entries(scene_key, context, waits=False)
         adopted = {it.key for it in adoption.list_adopted(self._store.database, scene_key)}
         rows = entries.rows()
-        found = [(row, *entries.reference(row)[:2]) for row in rows.tolist()]
-        surveyed = [it for it in found if it[2] not in adopted]
-        if not surveyed:
+        by_distance = np.argsort(np.linalg.norm(entries.centres(rows) - pose.translation, axis=1), kind="stable")
+        near = rows[by_distance[: MOST_CHOSEN_AMONG + len(adopted)]].tolist()
+        named = {row: entries.reference(row)[:2] for row in near}
+        chosen = np.array([row for row in near if named[row][1] not in adopted][:MOST_CHOSEN_AMONG], np.intp)
+        if not len(chosen):
             return None
-        chosen = np.array([row for row, _, _ in surveyed], np.intp)
         centres, axes = entries.centres(chosen), entries.axes(chosen)
+        ids, keys = zip(*(named[row] for row in chosen.tolist()), strict=True)
         nearest = rules.nearest_viewpoint(centres, axes, pose)
-        kept = np.argsort(np.linalg.norm(centres - pose.translation, axis=1), kind="stable")[:MOST_CHOSEN_AMONG]
-        return Place(
-            [surveyed[i][1] for i in kept.tolist()],
-            [surveyed[i][2] for i in kept.tolist()],
-            centres[kept],
-            axes[kept],
-            surveyed[nearest][2],
-            surveyed[nearest][1],
-        )
+        return Place(ids, keys, centres, axes, keys[nearest], ids[nearest])
 
     async def _localized(self, query: Query, place: Place, mask: bytes) -> Result:
         """The photograph localized from surveyed references alone, without its priors and with another mask."""
@@ -288,24 +284,28 @@ class Adopter:
         surveyed: Evidence | None,
         policy: AdoptionPolicy,
         options: AdoptionOptions,
-    ) -> None:
-        """Counts what a photograph says of its place, and of the adopted references there."""
+    ) -> bool:
+        """Counts what a photograph says of its place, and of the adopted references there; whether it is outdated."""
         database, answered, scene_key = self._store.database, candidate.answered, candidate.query.scene_key
         share = rules.surveyed_share(answered, surveyed)
-        made = await asyncio.to_thread(
-            adoption.change_standings, database, [place.key], lambda _, it: rules.with_share(it, share, options)
-        )
+
+        def learned(_: str, known: Standing) -> Standing:
+            # Once outdated it stays so until a new survey: answers by what is left of the old one say nothing.
+            return known if rules.is_outdated(known, policy, options) else rules.with_share(known, share, options)
+
+        made = await asyncio.to_thread(adoption.change_standings, database, [place.key], learned)
         here = [it for it in await self._adopted(candidate) if it.place_key == place.key and not it.is_retired]
         if any(rules.is_outdated(it, policy, options) for it in made.values()):
             if await self._retire(scene_key, [it.key for it in here], RetirementReason.SURVEY_OUTDATED):
                 log.warning("scene %s: the place of %s needs a new survey", scene_key, place.reference_id)
-            return
+            return True
         total = max(answered.inlier_count, 1)
         useful = {
             it.key: rules.with_usefulness(it.usefulness, answered.inliers_of.get(it.reference_id, 0) / total, options)
             for it in here
         }
         await asyncio.to_thread(adoption.set_usefulness, database, useful)
+        return False
 
     async def _count_contradictions(
         self, scene_key: SceneKey, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
