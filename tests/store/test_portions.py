@@ -46,6 +46,7 @@ def test_the_last_change_until_a_generation_stays_the_same(store: Store) -> None
     fill(store, SCENE, 2)
     reader = IndexReader(store.database)
     first = reader.read_state(SCENE)
+    assert [reader.count(it) for it in (SCENE, OTHER)] == [2, 0]
     assert (first.reference_count, first.last_change) == (2, store.get_reference(SCENE, "r1").key)
     gone = store.delete_reference(SCENE, "r0")
     second = reader.read_state(SCENE)

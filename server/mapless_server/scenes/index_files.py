@@ -126,11 +126,8 @@ class IndexFiles:
             return None
 
     def is_large(self, scene_key: SceneKey) -> bool:
-        """Whether a scene, which exists, is large enough for a file."""
-        try:
-            return self._reader.read_state(scene_key).reference_count >= self.options.least_references
-        except NotFound:
-            return False
+        """Whether a scene is large enough for a file."""
+        return self._reader.count(scene_key) >= self.options.least_references
 
     def read(self, scene_key: SceneKey) -> Future[Read]:
         """Reads a large scene into memory, in portions, which takes less memory than all at once, in a thread.
@@ -160,9 +157,19 @@ class IndexFiles:
         with self._unfinished(scene_key) as file:
             self._write(scene_key, file)
 
-    def consider(self, scene_key: SceneKey, entries: Entries, adopt: Callable[[SceneIndex], None]) -> None:
-        """Has a scene's file made if it needs one, or another one; `adopt` then gets its index, in the thread."""
-        if not self._is_due(entries) or self._store.database.only_reads:
+    def is_due(self, entries: Entries) -> bool:
+        """Whether a scene needs a file, or another one."""
+        options = self.options
+        if entries.file is None:
+            return len(entries) >= options.least_references and entries.described_count >= options.least_references
+        new, gone = entries.changed_counts()
+        if new + gone > max(options.least_changed, options.changed_share * len(entries)):
+            return True
+        return gone > 0 and time.time() - entries.file.made_time_s > options.longest_kept_s
+
+    def want(self, scene_key: SceneKey, adopt: Callable[[SceneIndex], None]) -> None:
+        """Has a scene's file made; `adopt` then gets its index, in the thread."""
+        if self._store.database.only_reads:
             return
         with self._lock:
             rests = time.monotonic() < self._rests_until_s.get(scene_key, 0.0)
@@ -185,15 +192,6 @@ class IndexFiles:
         self._wanted.put(None)
         if self._thread is not None:
             self._thread.join()
-
-    def _is_due(self, entries: Entries) -> bool:
-        options = self.options
-        if entries.file is None:
-            return len(entries) >= options.least_references and entries.described_count >= options.least_references
-        new, gone = entries.changed_counts()
-        if new + gone > max(options.least_changed, options.changed_share * len(entries)):
-            return True
-        return gone > 0 and time.time() - entries.file.made_time_s > options.longest_kept_s
 
     def _path(self, scene_key: SceneKey) -> Path:
         return self._folder / self._identity_of(scene_key, 0).file_name()
@@ -257,7 +255,7 @@ class IndexFiles:
     def _make(self, scene_key: SceneKey, adopt: Callable[[SceneIndex], None]) -> None:
         with self._unfinished(scene_key) as file:
             opened = self.open(scene_key)  # maybe one that another server has made
-            if opened is None or self._is_due(opened[0].entries()):
+            if opened is None or self.is_due(opened[0].entries()):
                 begin_s, cpu_begin_s = time.monotonic(), time.thread_time()
                 self._write(scene_key, file)
                 took_s, cpu_s = time.monotonic() - begin_s, time.thread_time() - cpu_begin_s

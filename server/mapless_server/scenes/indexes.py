@@ -276,9 +276,8 @@ class SceneIndexes:
                     cached.reading = None
 
     def _consider(self, scene_key: SceneKey, cached: _CachedIndex) -> None:
-        if self._files is not None:
-            adopt = partial(cached.adopt, self._store, scene_key, self._descriptor.name)
-            self._files.consider(scene_key, cached.index.entries(), adopt)
+        if self._files is not None and self._files.is_due(cached.index.entries()):
+            self._files.want(scene_key, partial(cached.adopt, self._store, scene_key, self._descriptor.name))
 
     def _discard_damaged(self, scene_key: SceneKey, cached: _CachedIndex) -> None:
         if self._files is not None and cached.is_damaged:

@@ -59,6 +59,12 @@ class IndexReader:
         with self._database.read() as connection:
             return _read_portion(connection, scene_key, after_id, count, descriptor_name)
 
+    def count(self, scene_key: SceneKey) -> int:
+        """Number of references of a scene; 0 if there is no such scene."""
+        counted = select(tables.scene.c.reference_count).where(tables.scene.c.scene_id == scene_key)
+        with self._database.read() as connection:
+            return connection.scalar(counted) or 0
+
     def read_state(self, scene_key: SceneKey, until_generation: int | None = None) -> IndexState:
         """Reads the state; the last change is that until a generation, None for all. NotFound if there is no scene."""
         with self._database.read() as connection:
