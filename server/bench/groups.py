@@ -2,7 +2,7 @@
 
 Of each folder some photographs are left out, which are then asked with their scene named, and among all scenes; and
 among the scenes of other places only, where none must be localized. Of 200 scenes, those of the folders and others
-with the mirror images of their photographs, the cost is compared with that of one scene of all references.
+with flipped photographs of these, the cost is compared with that of one scene of all references.
 
 The engine works in this process, without work in the background, on a store that has all features. Processor time is
 that of a query's stages, by turns, after a first query that fills the caches.
@@ -45,7 +45,7 @@ ALL = SceneKey("all")
 APART = 10_000.0
 """Distance of the folders' worlds in the one scene of all references."""
 SCENES, SMALL = 200, 2
-"""Scenes of the group whose cost is measured, and references of those with mirror images."""
+"""Scenes of the group whose cost is measured, and references of those with flipped photographs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +129,13 @@ def store_folders(store: Store, engine: QueueEngine, folders: Sequence[Folder]) 
         print(f"stored {folder.scene}: {len(folder.references)} references", flush=True)
 
 
-def described(engine: QueueEngine, frame: Frame, name: str, is_mirrored: bool = False) -> NewReference:
-    """A reference with all features, of a photograph or of its mirror image."""
+def described(engine: QueueEngine, frame: Frame, name: str, is_flipped: bool = False) -> NewReference:
+    """A reference with all features, of a photograph or of what is above in it below."""
     image = frame.image_path.read_bytes()
-    if is_mirrored:
+    if is_flipped:
         pixels = cv2.imdecode(np.frombuffer(image, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         assert pixels is not None, frame.image_path
-        image = cv2.imencode(".jpg", cv2.flip(pixels, 1))[1].tobytes()
+        image = cv2.imencode(".jpg", cv2.flip(pixels, 0))[1].tobytes()
     (found,) = describe_all(engine, [Photo(image, frame.camera, "image")])
     return NewReference(name, image, frame.camera, frame.world_from_camera, found.views, found.descriptors)
 
@@ -143,10 +143,9 @@ def described(engine: QueueEngine, frame: Frame, name: str, is_mirrored: bool = 
 def store_many(store: Store, engine: QueueEngine, folders: Sequence[Folder]) -> list[SceneKey]:
     """Stores many scenes, and one of all their references; returns the many, those of the folders first."""
     scenes = {folder.scene: [described(engine, it, "") for it in folder.references] for folder in folders}
-    frames = [it for folder in folders for it in folder.references]
+    flipped = [described(engine, it, "", is_flipped=True) for folder in folders for it in folder.references]
     for k in range(SCENES - len(folders)):
-        some = [frames[(k * SMALL + i) % len(frames)] for i in range(SMALL)]
-        scenes[SceneKey(f"mirrored-{k}")] = [described(engine, it, "", is_mirrored=True) for it in some]
+        scenes[SceneKey(f"flipped-{k}")] = [flipped[(k * SMALL + i) % len(flipped)] for i in range(SMALL)]
     store.create_scene(ALL)
     for number, (scene, references) in enumerate(scenes.items()):
         store.create_scene(scene)

@@ -25,7 +25,7 @@ from mapless_server.method.judge.decide import Verdict
 from mapless_server.method.judge.hypothesis import Attempt, Doubt, Found, Hypothesis
 from mapless_server.method.judge.worlds import World, decide_among
 from mapless_server.method.pairs.correspond import Compared
-from mapless_server.method.promise import PROMISE, PromiseOptions
+from mapless_server.method.promise import PromiseOptions
 from mapless_server.scenes import RankedReference
 from mapless_server.scenes.library import FeaturesMissing
 from mapless_server.security import scene_id_of
@@ -106,7 +106,7 @@ def _by_matches(search: Search, found: Sequence[Chosen], tier: Tier, compared: C
         if not ranked or step == 1:
             return ranked
         is_clear = ranked[0].agreement >= LEAST_AGREEMENT
-        others = [it for it in ranked[1:] if it.agreement >= PROMISE.agreement]
+        others = [it for it in ranked[1:] if it.may_rival(ranked[0])]
         again = {it.question.scene_key for it in (others if is_clear else ranked)}
         counts = {it.key: len(them) for it, them in zip((r for _, some in loaded for r in some), sample, strict=True)}
         most = 2 if is_clear else len(counts)
@@ -133,7 +133,11 @@ def _agreements(
         pairs = [(reference, next(rest)) for reference in references]
         similar = [similarity_of(view, reference.view, them) for reference, them in pairs]
         agreement = math.sqrt(step) * choosing.agreement_of(similar, references, is_enough=True)
-        ranked.append(_ranked(question, chosen, step * max(len(them) for _, them in pairs), agreement))
+        agreeing = step * max((it.agreeing for it in similar if it), default=0)
+        most = step * max(len(them) for _, them in pairs)
+        ranked.append(
+            replace(_ranked(question, chosen), match_count=most, agreement=agreement, agreeing_count=agreeing)
+        )
     return ranked
 
 
@@ -148,11 +152,8 @@ def _loaded(search: Search, chosen: Chosen, tier: Tier) -> tuple[PosedView, ...]
         return ()
 
 
-def _ranked(
-    question: SceneQuestion, chosen: Sequence[RankedReference], match_count: int = 0, agreement: float = 0.0
-) -> RankedScene:
-    similarity = max((it.similarity for it in chosen), default=0.0)
-    return RankedScene(question, len(chosen), similarity, match_count, agreement)
+def _ranked(question: SceneQuestion, chosen: Sequence[RankedReference]) -> RankedScene:
+    return RankedScene(question, len(chosen), max((it.similarity for it in chosen), default=0.0))
 
 
 def is_of_scene(failure: Exception) -> bool:
@@ -179,7 +180,8 @@ def doubting(search: Search, found: Found) -> Found:
     assert search.group is not None
     rank = search.group.next_scene((*search.tried, search.attempt))
     is_accepted = isinstance(found, Hypothesis) and found.is_accepted
-    if not is_accepted or rank is None or search.group.ranking[rank].agreement < PROMISE.agreement:
+    ranking = search.group.ranking
+    if not is_accepted or rank is None or not ranking[rank].may_rival(ranking[search.attempt.scene]):
         return found
     return replace(found, doubts=found.doubts | Doubt.OTHER_SCENE)
 

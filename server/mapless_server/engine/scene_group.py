@@ -6,7 +6,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from mapless_server.method.judge.decide import PLACES
 from mapless_server.method.judge.hypothesis import Attempt, Where
+from mapless_server.method.promise import PROMISE
 
 from .query import Query, SceneQuestion, SceneTried
 
@@ -29,6 +31,7 @@ class RankedScene:
         reference_count, similarity, match_count: as of `SceneTried`.
         agreement: the largest that the photograph's matches with them show, see `choosing.agreement_of`; 0 where no
             other scene had any.
+        agreeing_count: most matches with one of them that agree with one another.
     """
 
     question: SceneQuestion
@@ -36,6 +39,16 @@ class RankedScene:
     similarity: float
     match_count: int = 0
     agreement: float = 0.0
+    agreeing_count: int = 0
+
+    def may_rival(self, other: RankedScene) -> bool:
+        """Whether a pose in it may explain the photograph about as well as one in another scene.
+
+        Its score must not be clearly less. Matches that agree in the image show that roughly, so it may be so much less
+        twice.
+        """
+        is_alike = self.agreeing_count * PLACES.clearly_more**2 >= other.agreeing_count
+        return is_alike and self.agreement >= PROMISE.agreement
 
 
 @dataclass(frozen=True, eq=False)
