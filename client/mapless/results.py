@@ -75,6 +75,21 @@ class Scene:
     pending_work: tuple[PendingWork, ...] = ()
 
 
+@dataclass(frozen=True)
+class PlaceState:
+    """What photographs that were considered for adoption showed of the place of a surveyed reference.
+
+    Attributes:
+        surveyed_share: share of their matches that surveyed references supported, 0 to 1, a running mean.
+        photograph_count: photographs of the place, which is nearer to this reference than to any other.
+        contradiction_count: photographs in a row that should show what this reference shows, and do not.
+    """
+
+    surveyed_share: float
+    photograph_count: int
+    contradiction_count: int
+
+
 @dataclass(frozen=True, eq=False)
 class Reference:
     """A stored photograph.
@@ -96,6 +111,7 @@ class Reference:
         provenance: how its pose is known.
         retire_time: when the server retired it, so that it is chosen no more; None if it is not retired.
         retirement: why, one sentence for a person; empty if it is not retired.
+        place: what photographs showed that were considered for adoption; None where there were none.
     """
 
     scene_id: str
@@ -114,6 +130,7 @@ class Reference:
     depth_sha256: str = ""
     retire_time: datetime | None = None
     retirement: str = ""
+    place: PlaceState | None = None
 
 
 @dataclass(frozen=True, eq=False)

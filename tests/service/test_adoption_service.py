@@ -7,6 +7,7 @@ import pytest
 from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose
 
 from mapless import Accuracy, AdoptionPolicy, Client, NewReference, NotFound, Provenance, Voucher
+from mapless.results import PlaceState
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless_server.security import SceneKey
@@ -131,6 +132,8 @@ def test_places_that_need_a_new_survey_are_named(client: Client, server: Running
     )
     (warning,) = client.get_scene(adopting).warnings
     assert warning.startswith("photographs around r2 show too little of what was surveyed")
+    places = {it.reference_id: it.place for it in client.list_references(adopting)}
+    assert places == {"r0": None, "r1": None, "r2": PlaceState(0.2, 5, 0)}
     assert Standing(0, 0, 0.2, 5) == adoption.read_standings(store_of(server).database, [key])[key]
 
 

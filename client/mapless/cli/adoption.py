@@ -98,3 +98,13 @@ def adopted_table(references: list[Reference]) -> list[str]:
 def retired_table(references: list[Reference]) -> list[str]:
     """A table of retired references, with why."""
     return table(("REFERENCE", "WHY"), [(it.reference_id, it.retirement) for it in references])
+
+
+def places_table(references: list[Reference]) -> list[str]:
+    """A table of the places that photographs were considered of, those with the least survey left first."""
+    seen = [(it.place, it.reference_id) for it in references if it.place is not None]
+    rows = [
+        (name, f"{100 * it.surveyed_share:.0f} %", it.photograph_count, it.contradiction_count)
+        for it, name in sorted(seen, key=lambda both: (both[0].surveyed_share, both[1]))
+    ]
+    return table(("PLACE OF", "SURVEY LEFT", "PHOTOGRAPHS", "CONTRADICTIONS"), rows)

@@ -173,6 +173,7 @@ def _add_reference(reference: argparse.ArgumentParser) -> None:
     some = listing.add_mutually_exclusive_group()
     some.add_argument("--adopted", action="store_true", help="only adopted ones, with what vouches for them")
     some.add_argument("--retired", action="store_true", help="only retired ones, with why")
+    some.add_argument("--places", action="store_true", help="how much of the survey is left at places that adopt")
     listing.set_defaults(run=commands.list_references)
     adoption.add_actions(actions)
     for action, others, run, text in (

@@ -18,7 +18,7 @@ from ..pixels import format_of_image
 from ..provenance import ADOPTED, GIVEN, PLACED, Provenance
 from ..requests import NewReference
 from ..results import Reference, Scene, summary_of
-from .adoption import adopted_table, policy_of, policy_text, retired_table
+from .adoption import adopted_table, places_table, policy_of, policy_text, retired_table
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import depth_of, limits
 from .output import card, is_confirmed, plain, serving_states, show, table
@@ -176,6 +176,9 @@ def list_references(client: Client, arguments: argparse.Namespace) -> int:
         print("mapless: note: the scene's unit of length is arbitrary, not the metre", file=sys.stderr)
     wanted = {"only_adopted": arguments.adopted, "only_retired": arguments.retired}
     references = list(client.list_references(arguments.scene, **wanted))
+    if arguments.places:
+        seen = [it for it in references if it.place is not None]
+        return show(arguments, seen, places_table(seen))
     if arguments.adopted or arguments.retired:
         text = adopted_table(references) if arguments.adopted else retired_table(references)
         return show(arguments, references, text)

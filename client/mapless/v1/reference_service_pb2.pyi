@@ -145,7 +145,7 @@ class SceneCalibration(_message.Message):
     def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., reference_noise_m: _Optional[float] = ..., reference_noise_deg: _Optional[float] = ..., grows_with_gap: bool = ...) -> None: ...
 
 class Reference(_message.Message):
-    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance", "depth", "depth_sha256", "retire_time", "retirement")
+    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance", "depth", "depth_sha256", "retire_time", "retirement", "place")
     NAME_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
@@ -160,6 +160,7 @@ class Reference(_message.Message):
     DEPTH_SHA256_FIELD_NUMBER: _ClassVar[int]
     RETIRE_TIME_FIELD_NUMBER: _ClassVar[int]
     RETIREMENT_FIELD_NUMBER: _ClassVar[int]
+    PLACE_FIELD_NUMBER: _ClassVar[int]
     name: str
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
@@ -174,7 +175,18 @@ class Reference(_message.Message):
     depth_sha256: str
     retire_time: _timestamp_pb2.Timestamp
     retirement: str
-    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., depth_sha256: _Optional[str] = ..., retire_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., retirement: _Optional[str] = ...) -> None: ...
+    place: PlaceState
+    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., depth_sha256: _Optional[str] = ..., retire_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., retirement: _Optional[str] = ..., place: _Optional[_Union[PlaceState, _Mapping]] = ...) -> None: ...
+
+class PlaceState(_message.Message):
+    __slots__ = ("surveyed_share", "photograph_count", "contradiction_count")
+    SURVEYED_SHARE_FIELD_NUMBER: _ClassVar[int]
+    PHOTOGRAPH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    CONTRADICTION_COUNT_FIELD_NUMBER: _ClassVar[int]
+    surveyed_share: float
+    photograph_count: int
+    contradiction_count: int
+    def __init__(self, surveyed_share: _Optional[float] = ..., photograph_count: _Optional[int] = ..., contradiction_count: _Optional[int] = ...) -> None: ...
 
 class Provenance(_message.Message):
     __slots__ = ("source", "accuracy", "surveyed_share", "vouchers")

@@ -141,12 +141,7 @@ def read_standings(database: Database, keys: Collection[str]) -> dict[str, Stand
     column = reference_standing.c
     with database.read() as connection:
         found = connection.execute(select(reference_standing).where(column.reference_key.in_(sorted(keys))))
-        return {it.reference_key: _standing(it) for it in found}
-
-
-def _standing(row: Any) -> Standing:
-    share = row.surveyed_share
-    return Standing(row.contradiction_count, row.contradiction_time_us, share, row.photograph_count)
+        return {it.reference_key: rows.standing(it) for it in found}
 
 
 def list_places(database: Database, scene_key: SceneKey, least_photographs: int) -> dict[str, float]:
@@ -181,7 +176,7 @@ def change_standings(
                 continue
             queries.insert_new(connection, reference_standing, {"reference_key": key})
             row = connection.execute(select(reference_standing).where(column.reference_key == key).with_for_update())
-            made[key] = change(key, _standing(row.one()))
+            made[key] = change(key, rows.standing(row.one()))
             connection.execute(update(reference_standing).where(column.reference_key == key).values(vars(made[key])))
     return made
 

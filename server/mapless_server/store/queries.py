@@ -207,11 +207,9 @@ def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequen
 
 
 def select_references() -> Select[Any]:
-    """Columns of `reference`, and those that say whether and why it is retired."""
-    standing = reference_standing.c
-    return select(reference, standing.retire_time_us, standing.retire_reason).outerjoin(
-        reference_standing, standing.reference_key == reference.c.key
-    )
+    """Columns of `reference` and of `reference_standing`, null where nothing was said of a reference."""
+    said = [it for it in reference_standing.c if it.name != "reference_key"]
+    return select(reference, *said).outerjoin(reference_standing, reference_standing.c.reference_key == reference.c.key)
 
 
 def find_key(connection: Connection, scene_key: SceneKey, reference_id: str) -> str:

@@ -264,7 +264,8 @@ class ReferenceRecord:
         provenance: how its pose is known.
         depth_sha256: `DepthImage.sha256` of its depth; empty without one.
         retired: since when, UTC, and why it is not chosen any more; None if it is. Of those that are listed or got one
-            by one.
+            by one, as the next.
+        standing: what photographs said of it; None if there were none.
     """
 
     scene_key: SceneKey
@@ -279,6 +280,7 @@ class ReferenceRecord:
     provenance: Provenance = GIVEN_POSE
     depth_sha256: str = ""
     retired: Retirement | None = None
+    standing: Standing | None = None
 
     @property
     def scene_id(self) -> str:

@@ -30,6 +30,7 @@ from .records import (
     SceneAttributes,
     SceneRecord,
     SelfCalibration,
+    Standing,
 )
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
@@ -157,7 +158,14 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
         provenance=provenance,
         depth_sha256=row.depth_sha256 or "",
         retired=retirement(row),
+        standing=None if getattr(row, "photograph_count", None) is None else standing(row),
     )
+
+
+def standing(row: Row[Any]) -> Standing:
+    """Reads columns of the table `reference_standing`."""
+    share = row.surveyed_share
+    return Standing(row.contradiction_count, row.contradiction_time_us, share, row.photograph_count)
 
 
 def retirement(row: Row[Any]) -> Retirement | None:

@@ -99,6 +99,11 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
     if reference.retired is not None:
         message.retire_time.FromDatetime(reference.retired.time)
         message.retirement = retirement_of(reference.retired)
+    if reference.standing is not None:
+        known = reference.standing
+        message.place.surveyed_share = 1.0 if known.surveyed_share is None else known.surveyed_share
+        message.place.photograph_count = known.photograph_count
+        message.place.contradiction_count = known.contradiction_count
     message.create_time.FromDatetime(reference.create_time)
     return message
 

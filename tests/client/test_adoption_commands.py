@@ -1,0 +1,72 @@
+"""The commands by which an operator turns adoption on, sees what was adopted and retired, and undoes it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime, timedelta, timezone
+
+import pytest
+from support.commands import run_client
+from support.servers import CAMERA, PHOTO, RunningServer, pose
+
+from mapless import Accuracy, AdoptionPolicy, Client, NewReference, Provenance, Voucher
+from mapless_server.security import SceneKey
+from mapless_server.store import RetirementReason, adoption
+
+ADOPTED = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("r0", 40), Voucher("r1", 20)))
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs the command, which prints text: exit code, output and error output."""
+    return lambda *arguments: run_client(capsys, "--text", "--address", server.address, *arguments)
+
+
+def test_adoption_is_turned_on_changed_and_off(run: Run, client: Client, scene: str) -> None:
+    code, text, _ = run("scene", "update", scene, "--adopt")
+    assert (code, client.get_scene(scene).adoption) == (0, AdoptionPolicy())
+    assert "at most 4 a place, trust 0.5, within 0.03 (68 %), 30 % surveyed" in text
+    assert run("scene", "update", scene, "--adopt-most", "2", "--adopt-radius", "0.1")[0] == 0
+    assert client.get_scene(scene).adoption == AdoptionPolicy(most_per_place=2, max_radius_m=0.1)
+    code, _, error = run("scene", "update", scene, "--adopt-trust", "2")
+    assert (code, "min_trust must be 0 to 1, is 2" in error) == (2, True)
+    assert run("scene", "update", scene, "--forget", "adoption")[0] == 0
+    assert client.get_scene(scene).adoption is None
+
+
+def test_adopted_references_are_shown_and_undone(run: Run, client: Client, scene: str) -> None:
+    client.add_reference(scene, NewReference("new", PHOTO, CAMERA, pose(5.0), provenance=ADOPTED))
+    _, text, _ = run("reference", "list", scene, "--adopted")
+    assert [line.split()[:3] for line in text.splitlines()[1:]] == [["new", "50", "%"]]
+    assert "r0, r1" in text
+    assert "adopted from a localized photograph, within 0.02 (95 %)" in run("reference", "show", scene, "new")[1]
+    tomorrow = datetime.now(timezone.utc) + timedelta(days=1)
+    assert "0 adopted" in run("reference", "undo-adoption", scene, "--since", f"{tomorrow:%Y-%m-%d}", "--yes")[1]
+    assert "1 adopted" in run("reference", "undo-adoption", scene, "--since", "2026-01-01", "--yes")[1]
+    code, _, error = run("reference", "undo-adoption", scene, "--since", "monday")
+    assert (code, "is no time such as" in error) == (2, True)
+
+
+def test_retired_references_are_shown_and_restored(run: Run, server: RunningServer, client: Client, scene: str) -> None:
+    store = server.engine.references.retrievals[0].indexes._store
+    keys = store.find_keys(SceneKey(scene), ["r1"])
+    adoption.retire(store, SceneKey(scene), [keys["r1"]], RetirementReason.CONTRADICTED)
+    _, text, _ = run("reference", "list", scene, "--retired")
+    assert "do not show what it shows" in text
+    assert "retired on" in run("reference", "show", scene, "r1")[1]
+    assert run("reference", "restore", scene, "r1") == (0, "r1 is chosen for photographs\n", "")
+    assert list(client.list_references(scene, only_retired=True)) == []
+
+
+def test_places_with_the_least_survey_left_come_first(run: Run, server: RunningServer, scene: str) -> None:
+    store = server.engine.references.retrievals[0].indexes._store
+    keys = store.find_keys(SceneKey(scene), ["r0", "r2"])
+    shares = {keys["r0"]: 0.9, keys["r2"]: 0.2}
+    adoption.change_standings(
+        store.database, keys.values(), lambda key, it: replace(it, surveyed_share=shares[key], photograph_count=7)
+    )
+    _, text, _ = run("reference", "list", scene, "--places")
+    assert [line.split() for line in text.splitlines()[1:]] == [
+        ["r2", "20", "%", "7", "0"],
+        ["r0", "90", "%", "7", "0"],
+    ]
