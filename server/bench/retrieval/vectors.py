@@ -59,23 +59,20 @@ class Vectors:
 def planted(count: int, seed: int) -> Vectors:
     """Places with views along a path, by an autoregressive process; queries are further views beside the paths."""
     own = (NEXT_SIMILARITY - PLACE_SHARE) / (1 - PLACE_SHARE)
-
-    def place(random: np.random.Generator) -> tuple[Floats, Floats]:
-        """The views (VIEWS, D) of a place, and a query there."""
-        centre = _unit(_noise(random, 1))
-        steps = _noise(random, VIEWS + 1) * np.sqrt(1 - own**2)
-        path = [_noise(random, 1)[0]]
-        for step in steps[:-1]:
-            path.append(own * path[-1] + step)
-        beside = own * path[int(random.integers(VIEWS))] + steps[-1]
-        views = np.sqrt(PLACE_SHARE) * centre + np.sqrt(1 - PLACE_SHARE) * np.array([*path[:VIEWS], beside])
-        views = _unit(views)
-        return views[:-1], views[-1]
+    place_count = BLOCK // VIEWS
 
     def block(first: int) -> tuple[Floats, Floats]:
+        """The views (BLOCK, D) of some places, and a query at each (P, D)."""
         random = np.random.default_rng([seed, first])
-        places = [place(random) for _ in range(BLOCK // VIEWS)]
-        return np.concatenate([views for views, _ in places]), np.array([query for _, query in places])
+        centres = np.sqrt(PLACE_SHARE) * _unit(_noise(random, place_count))
+        path = np.empty((place_count, VIEWS, DIMENSION), np.float32)
+        path[:, 0] = _noise(random, place_count)
+        for i in range(1, VIEWS):
+            path[:, i] = own * path[:, i - 1] + np.sqrt(1 - own**2) * _noise(random, place_count)
+        at = path[np.arange(place_count), random.integers(VIEWS, size=place_count)]
+        beside = own * at + np.sqrt(1 - own**2) * _noise(random, place_count)
+        views = centres[:, None] + np.sqrt(1 - PLACE_SHARE) * path
+        return _unit(views.reshape(BLOCK, DIMENSION)), _unit(centres + np.sqrt(1 - PLACE_SHARE) * beside)
 
     firsts = range(0, count, BLOCK)
     some = np.unique(np.linspace(0, len(firsts) - 1, min(len(firsts), QUERIED_BLOCKS)).round().astype(int))
