@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -50,8 +51,12 @@ SITE_A: dict[str, str] = {"site": "a"}
 
 
 @pytest.fixture(scope="module")
-def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningServer]:
-    folder = tmp_path_factory.mktemp("several")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("several")
+
+
+@pytest.fixture(scope="module")
+def server(folder: Path) -> Iterator[RunningServer]:
     options: dict[str, Any] = {"features": "sift", "backend": "geometric", "background_matching": False}
     with serving_really(folder / "data", capture_dir=folder / "captured", allow_watching=True, **options) as server:
         with Client(server.address) as client:
@@ -245,10 +250,7 @@ def test_a_wrong_group_is_refused_by_its_field(
     assert refused.value.field == field
 
 
-def test_captured_calls_among_scenes_are_replayed_in_the_one_that_was_found(
-    client: Client, server: RunningServer, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.getbasetemp() / "several0"
+def test_captured_calls_among_scenes_are_replayed_in_the_one_that_was_found(client: Client, folder: Path) -> None:
     before = set(calls_of(folder / "captured"))
     moved = world_from_other_world(YARD, HALL).compose(TRUE)
     asked: list[dict[str, Any]] = [

@@ -74,8 +74,8 @@ def names_several(request: AnyRequest) -> bool:
     is_given = {"scene": request.scene, "scenes": request.scenes, "scene_group": message.HasField("scene_group")}
     given = [name for name, is_there in is_given.items() if is_there]
     if len(given) > 1:
-        message = f"must not be given together with {given[0]}: exactly one of {', '.join(is_given)} is required"
-        raise FieldError(given[1], message)
+        rule = f"exactly one of {', '.join(is_given)} is required"
+        raise FieldError(given[1], f"must not be given together with {given[0]}: {rule}")
     if not given:
         raise FieldError("scene", "must be scenes/{scene}, got ''; or give scenes or scene_group instead")
     return given != ["scene"]
