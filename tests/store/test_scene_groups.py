@@ -12,6 +12,7 @@ from mapless.geodesy import Datum
 from mapless_server.errors import DataLoss, NotFound
 from mapless_server.security import DEFAULT_TENANT, SceneKey, SceneLimit, key_of, scene_id_of
 from mapless_server.store import GroupedScene, SceneAttributes, Store
+from mapless_server.store.scene_groups import NAME_BYTES
 
 A, B, HALL = SceneKey("a"), SceneKey("b"), SceneKey("hall")
 NORTH = {"site": "north"}
@@ -176,6 +177,17 @@ def test_a_group_is_read_in_one_statement_and_not_again(place: Place) -> None:
         assert (len(group), len(named.found)) == (100, 64)
         assert len(first) == 2
         assert len(second) == (2 if isinstance(place, Shared) else 0)
+
+
+def test_names_without_scenes_count_in_the_cache(store: Store) -> None:
+    """With one scene that exists, each other name may be made up."""
+    store.create_scene(A)
+    sizes = []
+    for made_up in (0, 63):
+        before = store._groups._found.used
+        store.find_scenes_named([A, *(SceneKey(f"x{it}") for it in range(made_up))])
+        sizes.append(store._groups._found.used - before)
+    assert sizes[1] - sizes[0] == 63 * NAME_BYTES
 
 
 def test_a_damaged_scene_of_a_group_fails_alone(place: Place) -> None:

@@ -58,5 +58,6 @@ class SceneFinder:
             known = FoundScenes(scenes)
             if with_datum:
                 known = FoundScenes([it for it, its in zip(scenes, known.attributes, strict=True) if its.datum])
-            self._groups.put(name, (scenes, known), len(scenes))
+            if scenes:  # what is not there may be anything that a caller makes up
+                self._groups.put(name, (scenes, known), 1 + len(scenes))
         return known

@@ -95,7 +95,9 @@ class SceneGroups:
         before = None if self._database.is_shared else self._labelled.get((keys, limit.labels))
         return named | before[1] if before is not None and before[0] is state else None
 
-    def _look_up(self, name: Hashable, statement: Callable[[], Select[Any]], state: object) -> tuple[GroupedScene, ...]:
+    def _look_up(
+        self, name: tuple[Hashable, ...], statement: Callable[[], Select[Any]], state: object
+    ) -> tuple[GroupedScene, ...]:
         before = self._found.get(name)
         if before is not None and before[0] is state and not self._database.is_shared:
             return before[1]
@@ -107,7 +109,7 @@ class SceneGroups:
         if before is not None and found == before[1]:  # scenes are equal only to themselves
             found = before[1]
         if found:  # what is not there may be anything that a caller makes up
-            self._found.put(name, (state, found), SCENE_BYTES * (1 + len(found)))
+            self._found.put(name, (state, found), SCENE_BYTES * (1 + len(found)) + NAME_BYTES * len(name))
         return found
 
 
