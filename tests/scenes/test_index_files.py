@@ -1,5 +1,6 @@
 """Files of large scenes: searched as the store's scene is now, made again where they are not certainly of it."""
 
+import errno
 import logging
 import os
 import shutil
@@ -29,7 +30,7 @@ from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import ReferenceLibrary
 from mapless_server.scenes.retrieval import index_writer
 from mapless_server.scenes.retrieval.index import Entries
-from mapless_server.scenes.retrieval.index_file import BLOCK_ROWS, VERSION, Header
+from mapless_server.scenes.retrieval.index_file import BLOCK_ROWS, VERSION, Header, IndexFile
 from mapless_server.scenes.retrieval.lists import ListOptions
 from mapless_server.scenes.retrieval.ranking import Selection, rank_references
 from mapless_server.security import SceneKey
@@ -247,6 +248,25 @@ class TestDistrust:
         assert running.found() == expected
         running.filed()
         assert path.read_bytes() == right
+
+    def test_one_that_cannot_be_deleted_is_not_opened_again(
+        self, serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def refuse(*_: object, **__: object) -> None:
+            raise OSError(errno.EROFS, "Read-only file system")
+
+        indexes = serve()
+        indexes.filed()
+        path, expected = file_in(tmp_path / "indexes"), indexes.found()
+        path.write_bytes(path.read_bytes()[:-1])
+        restarted = serve(options=replace(OPTIONS, retry_s=3600.0))
+        monkeypatch.setattr(Path, "unlink", refuse)
+        monkeypatch.setattr(index_files, "unfinished", refuse)
+        assert restarted.found() == expected
+        restarted.of_scenes._cached.forget(lambda *_: True)
+        monkeypatch.setattr(IndexFile, "__init__", refuse)
+        assert restarted.found() == expected
+        monkeypatch.undo()
 
     @pytest.mark.parametrize("wrong", [b"", b"mapless", "half", "version", "longer"])
     def test_what_is_no_whole_file_of_this_version_is_not_used(

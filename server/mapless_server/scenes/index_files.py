@@ -39,6 +39,8 @@ log = logging.getLogger(__name__)
 
 _PORTION = 2000
 _LOOK_S = 0.01
+_BEING_MADE_S = 10.0
+"""Time between two looks whether another server has made a file."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ class IndexFiles:
         self._lock = threading.Lock()
         self._wanted: queue.SimpleQueue[tuple[SceneKey, Callable[[SceneIndex], None]] | None] = queue.SimpleQueue()
         self._waiting: set[SceneKey] = set()
+        self._useless: dict[Path, tuple[int, int] | None] = {}
         self._rests_until_s: dict[SceneKey, float] = {}
         self._readers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="large scenes")
         self._closing = threading.Event()
@@ -113,7 +116,8 @@ class IndexFiles:
     def open(self, scene_key: SceneKey) -> Read | None:
         """Opens the index of a scene, as it is in the store; None if there is no file that is certainly of it."""
         path = self._path(scene_key)
-        if not path.exists():  # as for most scenes: the store need not be asked
+        version = _version_of(path)
+        if version is None or version == self._useless.get(path):  # the store need not be asked
             return None
         try:
             return self._current(scene_key, IndexFile(path, self._identity(scene_key)))
@@ -122,7 +126,7 @@ class IndexFiles:
         except (NotThisIndex, IndexDamaged, OSError) as error:
             log.warning("the index file of scene %s is not used, and is made again: %s", scene_key, error)
             if not isinstance(error, OSError):
-                path.unlink(missing_ok=True)
+                self.discard(scene_key)
             return None
 
     def is_large(self, scene_key: SceneKey) -> bool:
@@ -182,8 +186,16 @@ class IndexFiles:
         self._wanted.put((scene_key, adopt))
 
     def discard(self, scene_key: SceneKey) -> None:
-        """Deletes the file of a scene that is damaged, or of a scene that was deleted."""
-        self._path(scene_key).unlink(missing_ok=True)
+        """Deletes the file of a scene that is damaged, or of a scene that was deleted.
+
+        One that cannot be deleted, as on a disk that can only be read, is not opened any more.
+        """
+        path = self._path(scene_key)
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            log.warning("the index file %s cannot be deleted: %s", path, error)
+            self._useless[path] = _version_of(path)
 
     def close(self) -> None:
         """Ends the thread after its current step; a file that it makes is given up."""
@@ -224,16 +236,19 @@ class IndexFiles:
         return index, damaged_ids
 
     def _run(self) -> None:
-        self._delete_abandoned()
+        is_tidy = False
         while (wanted := self._wanted.get()) is not None and not self._closing.is_set():
             scene_key, adopt = wanted
             try:
+                if not is_tidy:
+                    self._delete_abandoned()
+                    is_tidy = True
                 self._make(scene_key, adopt)
             except _Closing:
                 return
             except (NotFound, BeingMade) as error:  # the scene was deleted, or another server makes the file
                 log.info("no index file of scene %s is made: %s", scene_key, error)
-                self._rest(scene_key)
+                self._rest(scene_key, min(_BEING_MADE_S, self.options.retry_s))
             except Exception as error:
                 self._observer.count("background_failures")
                 log.warning(
@@ -244,13 +259,13 @@ class IndexFiles:
                     error,
                     exc_info=None if isinstance(error, OSError | RequestError) else error,
                 )
-                self._rest(scene_key)
+                self._rest(scene_key, self.options.retry_s)
             finally:
                 with self._lock:
                     self._waiting.discard(scene_key)
 
-    def _rest(self, scene_key: SceneKey) -> None:
-        self._rests_until_s[scene_key] = time.monotonic() + self.options.retry_s
+    def _rest(self, scene_key: SceneKey, rest_s: float) -> None:
+        self._rests_until_s[scene_key] = time.monotonic() + rest_s
 
     def _make(self, scene_key: SceneKey, adopt: Callable[[SceneIndex], None]) -> None:
         with self._unfinished(scene_key) as file:
@@ -315,6 +330,15 @@ class IndexFiles:
                 self._store.get_generation(SceneKey(header.identity.scene))
             except NotFound:
                 path.unlink(missing_ok=True)
+
+
+def _version_of(path: Path) -> tuple[int, int] | None:
+    """What distinguishes a file from others of its name; None if there is none."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 def _header_of(path: Path) -> Header | None:

@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, wait
 from functools import partial
 
@@ -263,14 +263,14 @@ class SceneIndexes:
         """Begins with a large scene's file or, without one, with what is read of it while this and other calls wait."""
         opened = files.open(scene_key)
         if opened is not None:
-            cached.begin(opened)
+            cached.begin(scene_key, opened)
         elif files.is_large(scene_key):
             with self._lock:
                 reading = cached.reading = cached.reading or files.read(scene_key)
             try:
                 while not wait([reading], _LOOK_S).done:
                     context.check()
-                cached.begin(reading.result())
+                cached.begin(scene_key, reading.result())
             finally:
                 if reading.done():  # it holds what it has read
                     cached.reading = None
@@ -330,12 +330,13 @@ class _CachedIndex:
             self.damaged_ids.update(changes.damaged)
             self.index = index
 
-    def begin(self, read: Read) -> None:
+    def begin(self, scene_key: SceneKey, read: Read) -> None:
         """Begins with what was read, unless the index has begun already."""
         with self.updating:
             if self.index.generation < 0:
                 self.index, damaged_ids = read
                 self.damaged_ids = set(damaged_ids)
+                _log_damaged(scene_key, damaged_ids)
 
     def describable(self, entries: Entries) -> list[tuple[str, str]]:
         """Id and key of the entries that have no descriptor but may get one."""
@@ -345,13 +346,7 @@ class _CachedIndex:
         with self.updating:
             since = self.index.generation
             changes = store.list_changes(scene_key, since if since >= 0 else None, descriptor)
-            for reference_id in changes.damaged:
-                log.error(
-                    "reference %s of scene %s is damaged in the store and is not chosen any more: delete it and add it "
-                    "again",
-                    reference_id,
-                    scene_key,
-                )
+            _log_damaged(scene_key, changes.damaged)
             if changes.is_whole:
                 self.damaged_ids.clear()
             self.damaged_ids.difference_update(it.reference_id for it in changes.added)
@@ -359,3 +354,9 @@ class _CachedIndex:
             if changes.is_whole or changes.generation != since:
                 self.index.apply(changes)
             return self.index.entries()
+
+
+def _log_damaged(scene_key: SceneKey, reference_ids: Iterable[str]) -> None:
+    message = "reference %s of scene %s is damaged in the store and is not chosen any more: delete it and add it again"
+    for reference_id in reference_ids:
+        log.error(message, reference_id, scene_key)
