@@ -11,6 +11,7 @@ from mapless import Accuracy, AdoptionPolicy, Provenance, Voucher
 from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, RetirementReason, SceneAttributes, Store, adoption
+from mapless_server.store.pairs import PairStore, Progress
 from mapless_server.store.records import Standing
 
 HALL = SceneKey("hall")
@@ -175,3 +176,20 @@ def test_the_policy_of_a_scene_is_kept(place: Place) -> None:
         store.update_scene(HALL, down_in_world=(0.0, 0.0, -1.0))
         assert store.get_attributes(HALL).adoption == AdoptionPolicy(most_per_place=2)
         assert store.update_scene(HALL, adoption=None).attributes.adoption is None
+
+
+def test_the_background_leaves_retired_references_alone(place: Place) -> None:
+    with place.open() as store:
+        keys, pairs, progress = hall(store), PairStore(store.database), Progress()
+        adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
+        claim = pairs.claim("nearest", progress)
+        assert claim is not None
+        assert claim.reference_id == "b"
+        pairs.add("nearest", claim, {}, is_complete=True)
+        assert pairs.claim("nearest", progress) is None
+        assert pairs.count_waiting("nearest") == 0
+        store.restore_reference(HALL, "a")
+        assert pairs.count_waiting("nearest") == 1
+        claim = pairs.claim("nearest", progress)
+        assert claim is not None
+        assert claim.reference_id == "a"

@@ -22,7 +22,7 @@ from mapless_server.security import SceneKey
 
 from . import codec, queries, rows
 from .database import Database, unless_damaged
-from .queries import is_detached
+from .queries import is_detached, is_retired
 from .tables import (
     matching_use,
     reference,
@@ -220,10 +220,11 @@ class PairStore:
             select(column.matching, func.count())
             .join(reference, reference.c.key == column.reference_key)
             .where(reference.c.scene_id == scene_key, column.matching.in_(matchings))
-            .where(or_(column.due_time_us.is_(None), column.failure_count > 0))
+            .where(or_(column.due_time_us.is_(None), column.failure_count > 0), ~is_retired(reference.c.key))
             .group_by(column.matching)
         )
         of_scene = select(func.count()).select_from(reference).where(reference.c.scene_id == scene_key)
+        of_scene = of_scene.where(~is_retired(reference.c.key))
         with self._database.read() as connection:
             counts = {row[0]: row[1] for row in connection.execute(complete)}
             return {name: counts.get(name, 0) for name in matchings} | {"": connection.scalar(of_scene) or 0}
@@ -237,6 +238,7 @@ class PairStore:
             .exists()
         )
         waiting = select(func.count()).select_from(reference).where(~is_detached(reference.c.scene_id), ~is_complete)
+        waiting = waiting.where(~is_retired(reference.c.key))
         with self._database.read() as connection:
             return connection.scalar(waiting) or 0
 
@@ -254,6 +256,7 @@ def _due(connection: Connection, matching: str) -> Sequence[Row[Any]]:
         select(reference.c.key, reference.c.scene_id, reference.c.reference_id)
         .join(reference_matching, column.reference_key == reference.c.key)
         .where(column.matching == matching, column.due_time_us <= rows.now_us(), ~is_detached(reference.c.scene_id))
+        .where(~is_retired(reference.c.key))
     )
     return connection.execute(due.limit(_CANDIDATES)).all()
 
@@ -284,6 +287,7 @@ def _new(connection: Connection, matching: str, progress: Progress) -> Sequence[
         new: Select[Any] = (
             select(reference.c.key, reference.c.scene_id, reference.c.reference_id)
             .where(reference.c.scene_id == scene_key, reference.c.generation > since, ~is_claimed)
+            .where(~is_retired(reference.c.key))
             .order_by(reference.c.generation, reference.c.key)
         )
         found = connection.execute(new.limit(_CANDIDATES)).all()

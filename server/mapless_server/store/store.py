@@ -388,6 +388,8 @@ class Store(StoreReader):
                 connection.execute(delete(removed).where(removed.c.scene_id == scene_key))
                 its = update(scene).where(scene.c.scene_id == scene_key)
                 connection.execute(its.values(first_generation=generation))
+                again = update(tables.reference).where(tables.reference.c.key == key)  # for work in the background
+                connection.execute(again.values(generation=generation))
         return self.get_reference(scene_key, reference_id)
 
     @observed
