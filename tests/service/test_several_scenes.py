@@ -179,6 +179,15 @@ def test_a_rig_that_fits_two_scenes_is_ambiguous(client: Client) -> None:
     assert sorted(it.scene for it in answer.hypotheses) == ["scenes/hall", "scenes/twin"]
 
 
+def test_the_log_of_a_rig_has_the_scene_of_its_answer(client: Client, caplog: pytest.LogCaptureFixture) -> None:
+    """Among the scenes of an ambiguous one, doll is the first, and has nothing to do with it."""
+    with caplog.at_level(logging.INFO):
+        answer = client.localize_rig(rig_of([photograph(it) for it in WALK[:2]]), group={})
+        wait_until(lambda: any("LocalizeRig OK" in it.getMessage() for it in caplog.records))
+    (line,) = [it for it in caplog.records if it.getMessage() == "LocalizeRig OK"]
+    assert f"scenes/{vars(line)['fields']['scene']}" == answer.scene
+
+
 def test_a_rig_of_no_scene_is_rejected(client: Client) -> None:
     answer = client.localize_rig(rig_of([photograph(it, papers=ELSEWHERE) for it in WALK[:2]]), group=SITE_A)
     assert isinstance(answer, GroupRejected)

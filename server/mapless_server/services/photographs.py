@@ -69,6 +69,7 @@ async def in_common_scene(
             break
     scene_key = common_scene([it.results[0] for it in groups])
     if isinstance(scene_key, Rejection):
+        call.note(scene=groups[-1].results[-1].scene_key)
         return Ambiguous(GroupResult.of(groups), scene_key)
     return [in_scene(it, scene_key or queries[0].scene_key) for it in queries]
 
@@ -115,7 +116,9 @@ async def localize_photographs(
 
     The photographs, of one scene, are in the request's field `list_name`. RequestError as in `PhotoGroup.localize`.
     """
-    call.note(scene=queries[0].scene_key, images=len(queries))
+    call.note(images=len(queries))
+    if not queries[0].scenes:  # of several it is noted when it is found
+        call.note(scene=queries[0].scene_key)
     group = PhotoGroup(engine, queries, call.caller, list_name)
     try:
         return await group.localize()
