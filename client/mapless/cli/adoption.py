@@ -1,6 +1,7 @@
 """Flags and commands about photographs that become references, and references that are retired."""
 
 import argparse
+from dataclasses import replace
 from datetime import datetime, timezone
 
 from ..client import Client
@@ -9,24 +10,29 @@ from ..scenes import AdoptionPolicy
 from .folder import EXIT_FAILED
 from .output import is_confirmed, show, table
 
+_POLICY = "values that are not given stay as the scene has them, at first the defaults"
+
 
 def add_policy(command: argparse.ArgumentParser) -> None:
     """Adds the flags that `policy_of` reads."""
-    group, default = command.add_argument_group("adoption"), AdoptionPolicy()
+    group, default = command.add_argument_group("adoption", _POLICY), AdoptionPolicy()
     group.add_argument(
         "--adopt", action="store_true", help="localized photographs whose requests allow it become references"
     )
     for flag, kind, unit, text in (
         ("most", int, "N", f"most adopted references at a place (default: {default.most_per_place})"),
         ("trust", float, "TRUST", f"least trust of an answer (default: {default.min_trust:g})"),
-        ("radius", float, "M", f"largest 68 %% radius of a position (default: {default.max_radius_m:g})"),
+        ("radius", float, "M", f"largest 68 %% radius, m or the scene's unit (default: {default.max_radius_m:g})"),
         ("surveyed", float, "SHARE", f"least share of surveyed matches (default: {default.min_surveyed_share:g})"),
     ):
         group.add_argument(f"--adopt-{flag}", type=kind, metavar=unit, help=text)
 
 
-def policy_of(arguments: argparse.Namespace) -> AdoptionPolicy | None:
-    """The adoption policy that the flags give; None without any. ValueError for one that is out of bounds."""
+def policy_of(arguments: argparse.Namespace, current: AdoptionPolicy | None = None) -> AdoptionPolicy | None:
+    """The adoption policy that the flags give, with the `current` one's other values; None without `--adopt`.
+
+    ValueError for a value that is out of bounds, or without `--adopt`.
+    """
     given = {
         "most_per_place": arguments.adopt_most,
         "min_trust": arguments.adopt_trust,
@@ -34,17 +40,21 @@ def policy_of(arguments: argparse.Namespace) -> AdoptionPolicy | None:
         "min_surveyed_share": arguments.adopt_surveyed,
     }
     given = {name: value for name, value in given.items() if value is not None}
-    return AdoptionPolicy(**given) if given or arguments.adopt else None
+    if arguments.adopt:
+        return replace(current or AdoptionPolicy(), **given)
+    if given:
+        raise ValueError("--adopt-most, --adopt-trust, --adopt-radius and --adopt-surveyed need --adopt")
+    return None
 
 
-def policy_text(policy: AdoptionPolicy | None) -> str | None:
-    """What a scene adopts, for a person; None if nothing."""
+def policy_text(policy: AdoptionPolicy | None, unit: str) -> str | None:
+    """What a scene with this unit of length adopts, for a person; None if nothing."""
     if policy is None:
         return None
     share = f"{100 * policy.min_surveyed_share:.0f} % surveyed"
     return (
         f"at most {policy.most_per_place} a place, trust {policy.min_trust:g}, "
-        f"within {policy.max_radius_m:g} (68 %), {share}"
+        f"within {policy.max_radius_m:g} {unit} (68 %), {share}"
     )
 
 
@@ -82,7 +92,8 @@ def undo_adoption(client: Client, arguments: argparse.Namespace) -> int:
     if not is_confirmed(arguments, f"delete what {arguments.scene} has adopted since {arguments.since.isoformat()}"):
         return EXIT_FAILED
     gone = client.undo_adoption(arguments.scene, arguments.since)
-    return show(arguments, gone, [f"{len(gone)} adopted references deleted", *(f"  {it.reference_id}" for it in gone)])
+    number = f"{len(gone)} adopted reference{'' if len(gone) == 1 else 's'} deleted"
+    return show(arguments, gone, [number, *(f"  {it.reference_id}" for it in gone)])
 
 
 def adopted_table(references: list[Reference]) -> list[str]:

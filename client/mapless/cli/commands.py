@@ -66,6 +66,8 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
         raise ValueError(f"{both[0]} is given, and to be forgotten")
     if not changes:
         raise ValueError("nothing to change: give --datum, --down, --unit, --label, --adopt or --forget")
+    if policy is not None and (current := client.get_scene(arguments.scene).adoption) is not None:
+        changes["adoption"] = policy_of(arguments, current)
     scene = client.update_scene(arguments.scene, **changes)
     _warn(scene.warnings)
     return show(arguments, scene, _scene_card(scene))
@@ -103,7 +105,7 @@ def _scene_card(scene: Scene) -> list[str]:
         datum=f"{_place(scene.datum)}, {scene.datum.height_m:.2f} m" if scene.datum else None,
         down=None if down is None else " ".join(f"{it:.4f}" for it in down),
         labels=_labels(scene) or None,
-        adopts=policy_text(scene.adoption),
+        adopts=policy_text(scene.adoption, "units" if scene.arbitrary_unit else "m"),
         calibration=f"measured with {calibration.query_count} photographs" if calibration else None,
         created=_minute(scene),
         background=f"still makes {summary_of(scene.pending_work)}" if scene.pending_work else None,

@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 def main(
-    references: Annotated[int, typer.Option(help="Size of the scene, in ten thousands.")] = 1_000_000,
+    references: Annotated[int, typer.Option(help="Size of the scene, a multiple of 10,000.")] = 1_000_000,
     queries: Annotated[int, typer.Option(help="Queries that are timed.")] = 2000,
     data: Annotated[Path | None, typer.Option(help="Folder of folders with photographs and cameras.json.")] = None,
     only: Annotated[str, typer.Option(help="planted or photographs; both if empty.")] = "",

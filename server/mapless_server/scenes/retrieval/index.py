@@ -3,7 +3,7 @@
 A scene is in memory, and its search is exact: every reference's similarity is computed, so nothing is missed and
 nothing has to be trained. It is bounded by memory bandwidth. Descriptors are held as 8-bit integers with the norm of
 each row, see `quantizing`. A reference takes D bytes and about 0.35 KB for its pose and its names: with 1024 numbers
-1.4 KB. One core of a busy machine ranks 1,000 references in 1 ms, 10,000 in 4 and 100,000 in 33.
+1.5 KB. One core of a busy machine ranks 1,000 references in 1 ms, 10,000 in 4 and 100,000 in 33.
 
 A large scene is in an index file, and only what has changed since is in memory. Its rows stand in lists of similar
 ones, of which a search reads the most similar; what it reads is compared in the same way (`Entries.similar`).
