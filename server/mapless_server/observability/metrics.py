@@ -54,10 +54,10 @@ COUNTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "stored_pairs_failures": ("Queries that could not look for stored pairs.", *_ALONE),
     "background_pairs": ("Pairs of references matched in the background.", *_ALONE),
     "background_cpu_seconds": (
-        "Processor time of the background matching's own thread, without that of the threads of BLAS and torch.",
+        "Processor time of the threads that match references and make index files, without those of BLAS and torch.",
         *_ALONE,
     ),
-    "background_failures": ("Failures of matching references in the background; each is tried again.", *_ALONE),
+    "background_failures": ("Failures of matching references and of making index files; each is tried again.", *_ALONE),
     "stored_depths": ("Depths of references that queries looked for.", *_LOOKED_UP),
     "depths": ("Depths of references that a network predicted, kept or dropped.", "result", ("kept", "dropped")),
     "depth_seconds": ("Time that this took.", *_ALONE),
