@@ -120,6 +120,18 @@ def test_a_position_narrows_the_scenes_to_those_in_its_reach(client: Client) -> 
     assert answer.diagnostics.searched_scene_count == 2
 
 
+def test_a_wrong_position_costs_no_answer(client: Client) -> None:
+    """A receiver's error of a hundred metres, in each world's east: the hall is searched after what is near."""
+    found(client, group=SITE_A)
+    at_yard = Priors(geo_position=GeoPositionPrior(47.001, 8.0, 5.0))
+    answer = found(client, group=SITE_A, priors=at_yard)
+    assert (answer.scene, [it.conflict for it in answer.prior_checks]) == ("scenes/hall", [True])
+    assert answer.diagnostics.searched_scene_count == 3
+    limited = PositionPrior(np.zeros(3), 20.0)
+    refused = client.localize(PHOTO, CAMERA, group=SITE_A, prior_scene="yard", priors=Priors(position=limited))
+    assert isinstance(refused, Rejected)
+
+
 @pytest.mark.parametrize("prior_scene", ["hall", "yard"])
 def test_a_pose_prior_in_any_world_helps_where_it_belongs(client: Client, prior_scene: str) -> None:
     there = TRUE if prior_scene == "hall" else world_from_other_world(YARD, HALL).compose(TRUE)

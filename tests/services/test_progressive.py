@@ -16,6 +16,7 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.errors import Overloaded
 from mapless_server.rpc import Call
 from mapless_server.scheduling import AnyJob, Flow, Job, Step
+from mapless_server.services.beyond import Asked
 from mapless_server.services.localization import GiveBetter, LocalizationService, better_then_final
 from mapless_server.services.messages.answers import answer_frames_of
 
@@ -119,7 +120,7 @@ def test_a_progressive_call_leaves_its_job_in_no_cycle() -> None:
         call = Call("id", time.monotonic(), math.inf)
         given: list[pb.LocalizeResponse] = []
         with suppress(Overloaded):
-            await service._answer(request, cast(Any, query), answer_frames_of(request), call, given.append)
+            await service._answer(request, Asked(cast(Any, query)), answer_frames_of(request), call, given.append)
 
     gc.collect()
     gc.disable()

@@ -18,16 +18,18 @@ from mapless_server.engine.groups import (
     MIN_FRAMES,
     GroupResult,
 )
-from mapless_server.engine.query import TRACK, Query, Result, SceneQuestion
+from mapless_server.engine.query import TRACK, Query, Result
 from mapless_server.errors import RequestError
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.method.structure.model import MetricScale
 from mapless_server.observability.metrics import LOCALIZED, Metrics
 from mapless_server.rpc import Call
+from mapless_server.scheduling import StageRecord
 from mapless_server.security import NOWHERE, Principal, SceneKey, tenant_of
 from mapless_server.store import SceneAttributes, Store
 
+from .beyond import Asked, may_be_beyond, searched_beyond
 from .capture.calls import Request, Response
 from .capture.recorder import Recorder
 from .finding import SceneFinder
@@ -44,8 +46,8 @@ from .messages.groups import (
     with_tracked_motion,
 )
 from .messages.priors import needs_attributes
-from .messages.queries import query_among, query_from_message
-from .messages.scenes import names_several, questions_from_message
+from .messages.queries import among, query_among, query_from_message
+from .messages.scenes import AskedScenes, names_several, questions_from_message
 from .photographs import Joint, localize_group
 from .reach import Reach
 from .watching import Watcher, Watchers
@@ -88,32 +90,31 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     async def Localize(self, request: pb.LocalizeRequest, call: Call) -> pb.LocalizeResponse:
         """Implements LocalizationService.Localize."""
-        query, frames = await self._query(request, call)
-        return await self._answer(request, query, frames, call)
+        asked, frames = await self._asked(request, call)
+        return await self._answer(request, asked, frames, call)
 
     async def LocalizeProgressively(
         self, request: pb.LocalizeRequest, call: Call
     ) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
         """Implements LocalizationService.LocalizeProgressively."""
-        query, frames = await self._query(request, call)
-        return better_then_final(partial(self._answer, request, query, frames, call))
+        asked, frames = await self._asked(request, call)
+        return better_then_final(partial(self._answer, request, asked, frames, call))
 
-    async def _query(self, request: pb.LocalizeRequest, call: Call) -> tuple[Query, AnswerFrames]:
+    async def _asked(self, request: pb.LocalizeRequest, call: Call) -> tuple[Asked, AnswerFrames]:
         """Converts a request to a query; FieldError or RequestError names the wrong field."""
         options, frames = self._engine().options, answer_frames_of(request)
         if names_several(request):
-            questions, prior_scene = await asyncio.to_thread(self._questions, request, call.principal)
-            call.note(scenes=len(questions))
-            return query_among(request, options, questions, prior_scene), frames
+            asked = await asyncio.to_thread(self._questions, request, call.principal)
+            call.note(scenes=len(asked.questions))
+            query, beyond = query_among(request, options, asked.questions, asked.prior_scene), asked.beyond
+            return Asked(query, None if beyond is None else lambda: among(query, beyond())), frames
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
         attributes = await self._attributes([request], scene_key)
         query = query_from_message(request, tenant_of(scene_key), options, attributes)
         call.note(scene=query.scene_key, references=len(query.reference_ids))
-        return query, frames
+        return Asked(query), frames
 
-    def _questions(
-        self, request: pb.LocalizeRequest, principal: Principal
-    ) -> tuple[Sequence[SceneQuestion], SceneKey | None]:
+    def _questions(self, request: pb.LocalizeRequest, principal: Principal) -> AskedScenes:
         """Finds the scenes of a request with several; FieldError or NotFound names the wrong field."""
         extents = self._engine().references.extents_m
         return questions_from_message(request, self._scenes.find(request, principal), principal.tenant, extents)
@@ -121,13 +122,15 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     async def _answer(
         self,
         request: pb.LocalizeRequest,
-        query: Query,
+        asked: Asked,
         frames: AnswerFrames,
         call: Call,
         give: GiveBetter | None = None,
     ) -> pb.LocalizeResponse:
         """Computes the final answer; before, gives what there is so far."""
-        engine, given_count = self._engine(), 0
+        engine, query, given_count = self._engine(), asked.query, 0
+        # What the functions below use, not the jobs: these hold the photograph, and the functions.
+        recorded: list[list[StageRecord]] = []
 
         def to_message(result: Result) -> pb.LocalizeResponse:
             response = outcome_to_message(result, query.options, frames, query.photo)
@@ -136,9 +139,11 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
                     getattr(response, echoed).CopyFrom(getattr(request, echoed))
             response.diagnostics.CopyFrom(diagnostics_to_message(result, query))
             response.diagnostics.request_id = call.request_id
-            response.diagnostics.queue_duration.FromNanoseconds(round(1e9 * sum(it.waited_s for it in records)))
+            response.diagnostics.queue_duration.FromNanoseconds(
+                round(1e9 * sum(it.waited_s for records in recorded for it in records))
+            )
             response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
-            processor_s = sum(it.processor_s for it in records)
+            processor_s = sum(it.processor_s for records in recorded for it in records)
             response.diagnostics.processor_duration.FromNanoseconds(round(1e9 * processor_s))
             return response
 
@@ -153,13 +158,19 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             given_count += 1
             give(to_message(result))
 
-        job = engine.query_job(query, call.caller, on_better=None if give is None else give_better)
-        records = job.records  # what the functions above use, not the job: it holds the photograph, and them
+        async def run(query: Query) -> Result:
+            job = engine.query_job(query, call.caller, on_better=None if give is None else give_better)
+            recorded.append(job.records)
+            return await engine.run(job)
+
         try:
-            result = await engine.run(job)
+            result = await run(query)
+            if asked.beyond is not None and may_be_beyond(result):
+                query, result = await searched_beyond(query, result, asked.beyond, run)
         finally:
             give = None  # a thread that has not noticed the end may still have a better one
-            call.record(records)
+            for records in recorded:
+                call.record(records)
         response, answer = to_message(result), result.answer
         self._count_attempts([result])
         parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}

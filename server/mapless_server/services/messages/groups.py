@@ -20,7 +20,7 @@ from mapless_server.method.bundle.estimate import accuracy_from_covariance
 from mapless_server.method.options import ChosenCamera, IntrinsicsSource, LocalizeOptions, Variant
 from mapless_server.method.rejection import Rejection
 from mapless_server.scenes import ANYWHERE
-from mapless_server.security import SceneKey, key_of
+from mapless_server.security import key_of
 from mapless_server.store import SceneAttributes
 
 from .answers import (
@@ -50,6 +50,7 @@ from .queries import (
     with_depth,
 )
 from .radii import ReportedRadii
+from .scenes import AskedScenes
 from .uncertainty import uncertain_options
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def queries_among(
     list_name: str,
     bounds: tuple[int, int],
     engine: EngineOptions,
-    questions: Callable[[pb.LocalizeRequest], tuple[Sequence[SceneQuestion], SceneKey | None]],
+    questions: Callable[[pb.LocalizeRequest], AskedScenes],
 ) -> tuple[Query, ...]:
     """Converts the photographs of a request with several scenes to queries among them.
 
@@ -112,7 +113,8 @@ def queries_among(
         for name in PRIORS:
             if message.HasField(name):
                 getattr(alone, name).CopyFrom(getattr(message, name))
-        return questions(alone)[0]
+        asked = questions(alone)
+        return [*asked.questions, *(() if asked.beyond is None else asked.beyond())]
 
     found = _asked(request, list_name, bounds, among)
     first = [(SceneQuestion(it[0].scene_key, ANYWHERE), ()) for it in found]

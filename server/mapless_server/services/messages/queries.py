@@ -140,15 +140,16 @@ def query_among(
     questions: Sequence[SceneQuestion],
     prior_scene: SceneKey | None,
 ) -> Query:
-    """Converts a request to a query among several scenes, at least one; FieldError or InvalidArgument as for one.
+    """Converts a request to a query among several scenes, at least one; FieldError or InvalidArgument as for one."""
+    return among(_query_in(request, engine, questions[0]), questions, prior_scene)
 
-    Among one scene it is the query of that scene.
-    """
-    query = _query_in(request, engine, questions[0])
+
+def among(query: Query, questions: Sequence[SceneQuestion], prior_scene: SceneKey | None = None) -> Query:
+    """The query of the same photograph among other scenes, at least one; among one it is the query of that scene."""
     if len(questions) == 1:
-        return query
+        return replace(query.in_scene(questions[0]), scenes=(), prior_scene=None)
     several = replace(query, scenes=questions, prior_scene=prior_scene)
-    return several.in_scene(SceneQuestion(query.scene_key, ANYWHERE))
+    return several.in_scene(SceneQuestion(questions[0].scene_key, ANYWHERE))
 
 
 def _query_in(

@@ -57,6 +57,21 @@ class FoundScenes:
         return np.array([nowhere if it is None else ecef_from_geodetic(it.origin) for it in datums]).reshape(-1, 3)
 
 
+@dataclass(frozen=True, eq=False)
+class AskedScenes:
+    """The scenes in which a request looks for its photograph.
+
+    Attributes:
+        questions: the scenes where its priors allow and expect the camera, each with the priors in its world.
+        prior_scene: the one in whose world a pose prior was given; None if none was.
+        beyond: makes the questions of the scenes that soft priors alone leave out; None if they leave out none.
+    """
+
+    questions: Sequence[SceneQuestion]
+    prior_scene: SceneKey | None = None
+    beyond: Callable[[], Sequence[SceneQuestion]] | None = None
+
+
 ReadExtents = Callable[[Sequence[GroupedScene]], Array]
 """Distances (N,) of the furthest references of scenes from the origins of their worlds, metres; infinite if unknown."""
 
@@ -96,11 +111,10 @@ def scene_keys_from_message(request: AnyRequest, tenant: str) -> list[SceneKey]:
 
 def questions_from_message(
     request: pb.LocalizeRequest, found: FoundScenes, tenant: str, extents: ReadExtents
-) -> tuple[Sequence[SceneQuestion], SceneKey | None]:
-    """The scenes to search, each with the request's priors in its world; and the scene of its pose prior, if any.
+) -> AskedScenes:
+    """The scenes to search for a request's photograph; FieldError names a wrong field.
 
-    Scenes that are further away than the priors allow are left out, as far as `extents` are known. FieldError names a
-    wrong field.
+    Scenes that are further away than the priors allow or expect are left out, as far as `extents` are known.
     """
     check_positions(request)
     if request.references:
@@ -108,12 +122,15 @@ def questions_from_message(
     in_world, on_earth = _parts_of(request)
     prior_index = _prior_scene(request, found, tenant, in_world)
     if not (in_world.ListFields() or on_earth.ListFields()):
-        return found.questions, None
+        return AskedScenes(found.questions)
     priors = _ScenePriors.of(found, in_world, prior_index, on_earth)
-    questions = [priors.question(i) for i in priors.reached(extents)]
-    if prior_index is None or not request.HasField("pose_prior"):
-        return questions, None
-    return questions, found.scenes[prior_index].scene_key
+    reached, beyond = priors.reached(extents)
+    has_pose = prior_index is not None and request.HasField("pose_prior")
+    return AskedScenes(
+        [priors.question(i) for i in reached],
+        found.scenes[prior_index].scene_key if has_pose and prior_index is not None else None,
+        (lambda: [priors.question_beyond(i) for i in beyond]) if beyond else None,
+    )
 
 
 def _parts_of(request: pb.LocalizeRequest) -> tuple[pb.LocalizeRequest, pb.LocalizeRequest]:
@@ -207,21 +224,33 @@ class _ScenePriors:
     def _prior_datum(self) -> Datum | None:
         return None if self.prior_index is None else self.found.attributes[self.prior_index].datum
 
-    def reached(self, extents: ReadExtents) -> Sequence[int]:
-        """Indices of the scenes that may have references where the priors allow or expect the camera."""
+    def question_beyond(self, index: int) -> SceneQuestion:
+        """The question of one scene where soft priors do not expect the camera: its references are chosen anywhere."""
+        question = self.question(index)
+        return replace(question, narrowing=question.narrowing.limits)
+
+    def reached(self, extents: ReadExtents) -> tuple[Sequence[int], Sequence[int]]:
+        """Indices of the scenes with references where the priors expect the camera, and of others where they allow it.
+
+        If they expect it in none that has a datum, it may be in all where they allow it.
+        """
         places = [] if self._prior_datum is None else [(self.given[0], self._prior_datum)]
         if self.on_earth.HasField("geo_position_prior"):
             places.append(narrowing_at_place(self.on_earth.geo_position_prior, "geo_position_prior"))
         count = len(self.found.scenes)
         if not places:
-            return range(count)
+            return range(count), ()
         placed = np.flatnonzero(np.isfinite(self.found.origins_in_ecef[:, 0]))
         origins, radii_m = self.found.origins_in_ecef[placed], extents(self.found.scenes)[placed]
-        kept = np.ones(len(placed), bool)
+        expected, allowed = np.ones((2, len(placed)), bool)
         for narrowing, datum in places:
-            kept &= narrowing.reaches(datum.ecef_from_world().inverse().apply(origins), radii_m)
-        beyond = placed[~kept] if kept.any() else placed[:0]
-        return np.delete(np.arange(count), beyond).tolist()
+            in_world = datum.ecef_from_world().inverse().apply(origins)
+            allowed &= narrowing.limits.reaches(in_world, radii_m)
+            expected &= narrowing.reaches(in_world, radii_m)
+        if not expected.any():
+            expected = allowed if allowed.any() else np.ones(len(placed), bool)
+        reached = np.delete(np.arange(count), placed[~expected]).tolist()
+        return reached, placed[allowed & ~expected].tolist()
 
 
 def _moved(narrowing: Narrowing, priors: Priors, other_from_world: RigidTransform) -> tuple[Narrowing, Priors]:
