@@ -53,7 +53,7 @@ def request(**fields: Any) -> pb.LocalizeRequest:
 
 
 def questions(scenes: FoundScenes, **fields: Any) -> Sequence[SceneQuestion]:
-    return questions_from_message(request(**fields), scenes, DEFAULT_TENANT, unknown)[0]
+    return questions_from_message(request(**fields), scenes, DEFAULT_TENANT, unknown).questions
 
 
 def unknown(scenes: Sequence[GroupedScene]) -> Array:
@@ -128,7 +128,8 @@ def test_a_pose_in_one_world_is_the_same_on_the_earth_in_another() -> None:
     sent = request(prior_scene="scenes/s0")
     sent.pose_prior.world_from_camera.CopyFrom(transform_to_message(POSE))
     sent.pose_prior.covariance.row_major.extend(COVARIANCE.ravel().tolist())
-    (here, there), prior_scene = questions_from_message(sent, found(HALL, YARD), DEFAULT_TENANT, unknown)
+    asked = questions_from_message(sent, found(HALL, YARD), DEFAULT_TENANT, unknown)
+    (here, there), prior_scene = asked.questions, asked.prior_scene
     assert prior_scene == "s0"
     assert here.priors.pose is not None
     assert there.priors.pose is not None
@@ -201,11 +202,13 @@ def test_scenes_beyond_a_geo_position_cost_no_conversion(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(module._ScenePriors, "question", counted)
     sent = request(geo_position_prior=GEO)
-    kept, _ = questions_from_message(sent, scenes, DEFAULT_TENANT, lambda them: np.full(len(them), 100.0))
-    assert [it.scene_key for it in kept] == ["s0", "s1998", "s1999"]
+    asked = questions_from_message(sent, scenes, DEFAULT_TENANT, lambda them: np.full(len(them), 100.0))
+    assert [it.scene_key for it in asked.questions] == ["s0", "s1998", "s1999"]
     assert len(converted) == 3
-    everywhere, _ = questions_from_message(sent, scenes, DEFAULT_TENANT, unknown)
-    assert len(everywhere) == 2_000
+    assert asked.beyond is not None
+    assert len(asked.beyond()) == 1_997
+    everywhere = questions_from_message(sent, scenes, DEFAULT_TENANT, unknown)
+    assert (len(everywhere.questions), everywhere.beyond) == (2_000, None)
 
 
 @pytest.mark.parametrize("fields", [{"geo_position_prior": GEO}, {"position_prior": NEAR, "prior_scene": "scenes/s0"}])
@@ -216,9 +219,8 @@ def test_a_scene_with_a_reference_that_is_likely_is_kept(fields: dict[str, Any])
     scenes = found(HALL, *(SceneAttributes(Datum(it.latitude_deg, it.longitude_deg, it.height_m)) for it in places))
     references = [generator.normal(0.0, 8.0, (5, 3)) for _ in scenes.scenes]
     extents_m = np.array([np.linalg.norm(it, axis=1).max() for it in references])
-    kept = {
-        it.scene_key for it in questions_from_message(request(**fields), scenes, DEFAULT_TENANT, lambda _: extents_m)[0]
-    }
+    asked = questions_from_message(request(**fields), scenes, DEFAULT_TENANT, lambda _: extents_m)
+    kept = {it.scene_key for it in asked.questions}
     for question, centres in zip(questions(scenes, **fields), references, strict=True):
         narrowing = question.narrowing
         limits = [it for it in (narrowing.position, *narrowing.likely_positions) if it is not None]
@@ -228,7 +230,7 @@ def test_a_scene_with_a_reference_that_is_likely_is_kept(fields: dict[str, Any])
 
 
 def test_a_geo_position_far_from_all_scenes_leaves_all() -> None:
-    kept, _ = questions_from_message(
+    asked = questions_from_message(
         request(geo_position_prior=GEO | {"latitude_deg": 0}), found(HALL, YARD), DEFAULT_TENANT, lambda _: np.ones(2)
     )
-    assert len(kept) == 2
+    assert (len(asked.questions), asked.beyond) == (2, None)
