@@ -222,3 +222,18 @@ def test_a_contradicted_reference_is_retired_and_restored(held: Held) -> None:
     assert "do not show what it shows" in retired.retirement
     held.client.restore_reference("room", "changed")
     assert list(held.client.list_references("room", only_retired=True)) == []
+
+
+def test_only_what_was_compared_is_contradicted(held: Held) -> None:
+    """More references show what a photograph shows than are chosen for it, as at a robot's dock; one has changed."""
+    query, other = held.place.queries[2], held.place.queries[6]
+    held.client.add_references("room", [it.reference() for it in held.place.references[1::2]])
+    held.client.add_reference("room", NewReference("changed", other.data, query.camera, query.world_from_camera))
+    candidate = held.candidate(query)
+    few = replace(candidate, query=replace(candidate.query, reference_count=3))
+    held.adopter._options = AdoptionOptions(contradictions=1, same_viewpoint_deg=30, same_viewpoint_share=0.3)
+    try:
+        held.consider(few)
+    finally:
+        held.adopter._options = None
+    assert [it.reference_id for it in held.client.list_references("room", only_retired=True)] == ["changed"]

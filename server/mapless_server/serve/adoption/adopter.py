@@ -38,7 +38,7 @@ from mapless_server.services.messages.answers import AnswerFrames, outcome_to_me
 from mapless_server.store import NewReference, RetirementReason, Store, adoption, time_us
 from mapless_server.store.records import Adopted, Standing
 
-from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px
+from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px, shares_compared
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +46,8 @@ MAX_WAITING, MAX_WAITING_BYTES = 32, 64 * 2**20
 """Photographs that wait to be considered, and their bytes together."""
 MOST_CHOSEN_AMONG = 1000
 """Surveyed references that a photograph is localized from again: the nearest, as many as a request may name."""
+MOST_COMPARED, MOST_SUPPORTING = 6, 4
+"""References that are compared with a photograph only to learn whether it contradicts them, and those beside them."""
 LIMIT_S = 120.0
 """For each localization; the server is idle."""
 QUIET_S = 1.0
@@ -203,7 +205,7 @@ class Adopter:
         place = await asyncio.to_thread(self._place, scene_key, candidate.answered.world_from_camera)
         if place is None:
             return self._counted(rules.Refusal.CHANGED)
-        result = await self._localized(candidate.query, place, candidate.query.photo.mask)
+        result = await self._localized(candidate.query, place.surveyed_ids, candidate.query.photo.mask)
         surveyed = self._evidence(candidate.query, result)
         is_outdated = await self._learn(candidate, place, surveyed, policy, options)
         refused = rules.refusal(policy, candidate.answered, surveyed, options)
@@ -214,7 +216,7 @@ class Adopter:
         if refused is None and surveyed is not None:
             refused = await self._adopt(candidate, place, surveyed, policy, options)
         if surveyed is not None and rules.is_certain(policy, surveyed):
-            await self._count_contradictions(scene_key, place, surveyed, result, options)
+            await self._count_contradictions(candidate, place, surveyed, result, options)
         return self._counted(refused)
 
     def _counted(self, refused: Refusal | None) -> Refusal | None:
@@ -238,12 +240,17 @@ class Adopter:
         nearest = rules.nearest_viewpoint(centres, axes, pose)
         return Place(ids, keys, centres, axes, keys[nearest], ids[nearest])
 
-    async def _localized(self, query: Query, place: Place, mask: bytes) -> Result:
-        """The photograph localized from surveyed references alone, without its priors and with another mask."""
+    async def _localized(
+        self, query: Query, reference_ids: Sequence[str], mask: bytes, *, rerank: bool = True
+    ) -> Result:
+        """The photograph localized from surveyed references alone, without its priors and with another mask.
+
+        Of these references the most similar are used, as usual; all of them without `rerank`.
+        """
         again = replace(
             query,
-            reference_ids=tuple(place.surveyed_ids),
-            rerank=True,
+            reference_ids=tuple(reference_ids),
+            rerank=rerank,
             photo=replace(query.photo, mask=mask),
             priors=NO_PRIORS,
             narrowing=ANYWHERE,
@@ -268,7 +275,7 @@ class Adopter:
         if rules.novelty(keypoints_px(result), by_all) < options.min_novelty:
             return rules.Refusal.NOTHING_NEW
         ignored = await asyncio.to_thread(self._explained_by, photo, size_px, inliers_px(result), options)
-        other = self._evidence(candidate.query, await self._localized(candidate.query, place, ignored))
+        other = self._evidence(candidate.query, await self._localized(candidate.query, place.surveyed_ids, ignored))
         return None if other is None or other.agrees_with(surveyed) else rules.Refusal.ELSEWHERE
 
     def _explained_by(self, photo: Photo, size_px: tuple[int, int], inliers: Array, options: AdoptionOptions) -> bytes:
@@ -308,10 +315,11 @@ class Adopter:
         return False
 
     async def _count_contradictions(
-        self, scene_key: SceneKey, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
+        self, candidate: Candidate, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
     ) -> None:
         """Counts what a photograph says of the surveyed references that should show what it shows, and retires some."""
-        now_us, shares = time_us(self._now()), self._shares(place, surveyed, result, options)
+        scene_key, now_us = candidate.query.scene_key, time_us(self._now())
+        shares = await self._shares(candidate.query, place, surveyed, result, options)
         standings = await asyncio.to_thread(
             adoption.change_standings,
             self._store.database,
@@ -324,14 +332,25 @@ class Adopter:
     async def _adopted(self, candidate: Candidate) -> list[Adopted]:
         return await asyncio.to_thread(adoption.list_adopted, self._store.database, candidate.query.scene_key)
 
-    @staticmethod
-    def _shares(place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions) -> dict[str, float]:
-        """Share of a photograph's matches with each reference that should show what it shows, by key."""
+    async def _shares(
+        self, query: Query, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
+    ) -> dict[str, float]:
+        """Share of a photograph's matches with references that should show what it shows, by key.
+
+        Only of references that it was compared with. The nearest of those that were not chosen for its answer are
+        compared now, together with the best of those that were.
+        """
         pose = surveyed.world_from_camera
-        chosen = rules.should_show(place.centres, place.axes, pose, distance_shown(result), options)
-        total = max(surveyed.inlier_count, 1)
-        named = [(place.surveyed_keys[i], place.surveyed_ids[i]) for i in chosen.tolist()]
-        return {key: surveyed.inliers_of.get(reference_id, 0) / total for key, reference_id in named}
+        expected = rules.should_show(place.centres, place.axes, pose, distance_shown(result), options)
+        key_of = {place.surveyed_ids[i]: place.surveyed_keys[i] for i in expected.tolist()}
+        shares = shares_compared(surveyed, result)
+        if left := [it for it in key_of if it not in shares][:MOST_COMPARED]:  # the nearest come first
+            supporting = sorted(surveyed.inliers_of, key=lambda it: -surveyed.inliers_of[it])[:MOST_SUPPORTING]
+            compared = await self._localized(query, [*supporting, *left], query.photo.mask, rerank=False)
+            found = self._evidence(query, compared)
+            if found is not None and found.agrees_with(surveyed):
+                shares = shares_compared(found, compared) | shares
+        return {key: shares[it] for it, key in key_of.items() if it in shares}
 
     async def _adopt(
         self,

@@ -32,6 +32,12 @@ def evidence_of(response: pb.LocalizeResponse, result: Result) -> Evidence | Non
     )
 
 
+def shares_compared(found: Evidence, result: Result) -> dict[str, float]:
+    """Share of a photograph's matches with each reference that it was compared with, by id."""
+    ids = (parse_reference_name(it.name)[1] for it in result.references)
+    return {it: found.inliers_of.get(it, 0) / max(found.inlier_count, 1) for it in ids}
+
+
 def inliers_px(result: Result) -> Array:
     """The keypoints (M, 2) of the matches that agree with a pose, pixels of the photograph as it was sent."""
     support = result.answer.support
