@@ -10,10 +10,10 @@ from mapless import AdoptionPolicy
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
+from mapless_server.security import Principal, Role
 from mapless_server.store.records import Standing
 
 POLICY, OPTIONS = AdoptionPolicy(), AdoptionOptions()
-HOUR_US = 3_600_000_000
 HERE = RigidTransform(np.eye(3), np.zeros(3))
 
 
@@ -87,15 +87,38 @@ def test_a_place_is_outdated_by_several_photographs() -> None:
     assert not rules.is_outdated(known, POLICY, OPTIONS)
 
 
-def test_contradictions_count_in_a_row_one_an_hour() -> None:
-    known, now_us = Standing(), 10**15
-    for _ in range(1000):  # of one visitor
-        known = rules.with_photograph(known, 0.0, now_us, OPTIONS)
-    assert known.contradiction_count == 1
-    known = rules.with_photograph(known, 0.0, now_us + HOUR_US, OPTIONS)
+def contradicted(days: int, *holders: str, each: int = 1) -> Standing:
+    """What is known after photographs on so many days, `each` of each of these holders."""
+    known = Standing()
+    for photograph in range(days * each):
+        now_us = 10**15 + photograph // each * rules.DAY_US
+        for holder in holders:
+            known = rules.with_photograph(known, 0.0, now_us, holder, OPTIONS)
+    return known
+
+
+def test_contradictions_count_in_a_row_one_a_day() -> None:
+    known = contradicted(2, "one", each=1000)
     assert known.contradiction_count == 2
-    assert rules.with_photograph(known, 0.07, now_us + 2 * HOUR_US, OPTIONS) == known
-    assert rules.with_photograph(known, 0.1, now_us + 2 * HOUR_US, OPTIONS).contradiction_count == 0
+    now_us = 10**15 + 2 * rules.DAY_US
+    assert rules.with_photograph(known, 0.07, now_us, "one", OPTIONS) == known
+    assert rules.with_photograph(known, 0.1, now_us, "one", OPTIONS) == Standing(0, known.contradiction_time_us)
+
+
+def test_one_holder_or_one_day_retires_no_reference() -> None:
+    assert not rules.is_contradicted(contradicted(1000, "one", each=2), OPTIONS)
+    assert not rules.is_contradicted(contradicted(2, *"abcdefgh"), OPTIONS)
+    assert not rules.is_contradicted(contradicted(2, "one", "two"), OPTIONS)
+    assert rules.is_contradicted(contradicted(3, "one", "two"), OPTIONS)
+    assert not rules.is_contradicted(contradicted(4, ""), OPTIONS)
+    assert rules.is_contradicted(contradicted(5, ""), OPTIONS)
+
+
+def test_a_holder_is_a_token_of_a_tenant() -> None:
+    named = Principal("acme", Role.LOCALIZE, "robot")
+    assert rules.holder_of(named) != rules.holder_of(Principal("other", Role.LOCALIZE, "robot"))
+    assert rules.holder_of(named) != rules.holder_of(Principal("acme", Role.LOCALIZE, "robot2"))
+    assert rules.holder_of(Principal("acme", Role.WRITE, "operator")) == ""
 
 
 def test_the_least_useful_makes_room() -> None:

@@ -209,11 +209,11 @@ def test_a_contradicted_reference_is_retired_and_restored(held: Held) -> None:
     changed = NewReference("changed", other.data, query.camera, query.world_from_camera)
     held.client.add_reference("room", changed)
     candidate = held.candidate(query)
-    held.adopter._options = AdoptionOptions(contradictions=2)
+    held.adopter._options = AdoptionOptions(contradictions=2, contradicting_days=2)
     try:
-        for hour in range(2):
+        for day in range(2):
             assert list(held.client.list_references("room", only_retired=True)) == []
-            held.adopter._now = partial(now.__add__, timedelta(hours=hour))
+            held.adopter._now = partial(now.__add__, timedelta(days=day))
             held.consider(candidate)
     finally:
         held.adopter._now, held.adopter._options = lambda: datetime.now(timezone.utc), None
@@ -231,7 +231,9 @@ def test_only_what_was_compared_is_contradicted(held: Held) -> None:
     held.client.add_reference("room", NewReference("changed", other.data, query.camera, query.world_from_camera))
     candidate = held.candidate(query)
     few = replace(candidate, query=replace(candidate.query, reference_count=3))
-    held.adopter._options = AdoptionOptions(contradictions=1, same_viewpoint_deg=30, same_viewpoint_share=0.3)
+    held.adopter._options = AdoptionOptions(
+        contradictions=1, contradicting_days=1, same_viewpoint_deg=30, same_viewpoint_share=0.3
+    )
     try:
         held.consider(few)
     finally:

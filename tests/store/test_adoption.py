@@ -157,12 +157,22 @@ def test_standings_are_counted_and_forgotten_when_restored(place: Place) -> None
         keys = hall(store)
 
         def counted(key: str, it: Standing) -> Standing:
-            return replace(it, contradiction_count=it.contradiction_count + 1, surveyed_share=0.25, photograph_count=5)
+            return replace(
+                it,
+                contradiction_count=it.contradiction_count + 1,
+                surveyed_share=0.25,
+                photograph_count=5,
+                contradicted_by=("7:", "8:a"),
+            )
 
         change: Callable[[str, Standing], Standing] = counted
         for _ in range(2):
             made = adoption.change_standings(store.database, [keys["a"], "gone"], change)
-        assert made == {keys["a"]: Standing(2, 0, 0.25, 5)} == adoption.read_standings(store.database, keys.values())
+        assert (
+            made
+            == {keys["a"]: Standing(2, 0, 0.25, 5, ("7:", "8:a"))}
+            == adoption.read_standings(store.database, keys.values())
+        )
         assert adoption.list_places(store.database, HALL, 5) == {"a": 0.25}
         assert adoption.list_places(store.database, HALL, 6) == {}
         adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)

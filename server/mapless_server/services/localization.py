@@ -58,8 +58,8 @@ if TYPE_CHECKING:  # services do not load what computes
 GiveBetter = Callable[[pb.LocalizeResponse], None]
 """Receives an answer that is better than those before, while the final one is computed."""
 
-Offer = Callable[[pb.LocalizeRequest, pb.LocalizeResponse, Query, Result], None]
-"""Receives a request and its answer, which may become a reference; must return at once."""
+Offer = Callable[[pb.LocalizeRequest, pb.LocalizeResponse, Query, Result, Principal], None]
+"""Receives a request, its answer and its caller, which may become a reference; must return at once."""
 
 
 class LocalizationService(rpcs.LocalizationServiceServicer):
@@ -189,7 +189,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         if not request.options.confidential:
             self._watchers.publish(result.scene_key, request, response, debug)
         if self.offer is not None:
-            self.offer(request, response, query, result)
+            self.offer(request, response, query, result, call.principal)
         return response
 
     async def _debug_of(self, answer: Answer, is_wanted: bool) -> pb.Debug | None:

@@ -177,7 +177,8 @@ def change_standings(
             queries.insert_new(connection, reference_standing, {"reference_key": key})
             row = connection.execute(select(reference_standing).where(column.reference_key == key).with_for_update())
             made[key] = change(key, rows.standing(row.one()))
-            connection.execute(update(reference_standing).where(column.reference_key == key).values(vars(made[key])))
+            values = vars(made[key]) | {"contradicted_by": " ".join(made[key].contradicted_by)}
+            connection.execute(update(reference_standing).where(column.reference_key == key).values(values))
     return made
 
 

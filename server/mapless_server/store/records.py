@@ -237,6 +237,7 @@ class Standing:
     Attributes:
         contradiction_count: photographs in a row that should show what it shows, and do not.
         contradiction_time_us: when the last one was counted, microseconds since 1970.
+        contradicted_by: the day and the holder of each of the last ones, see `adoption.policy.with_photograph`.
         surveyed_share: of a surveyed one, the share of matches with surveyed references in photographs of its place, a
             running mean over `photograph_count` of them; None without any.
     """
@@ -245,6 +246,7 @@ class Standing:
     contradiction_time_us: int = 0
     surveyed_share: float | None = None
     photograph_count: int = 0
+    contradicted_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

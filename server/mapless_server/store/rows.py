@@ -164,8 +164,8 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
 
 def standing(row: Row[Any]) -> Standing:
     """Reads columns of the table `reference_standing`."""
-    share = row.surveyed_share
-    return Standing(row.contradiction_count, row.contradiction_time_us, share, row.photograph_count)
+    counted, witnesses = (row.contradiction_count, row.contradiction_time_us), tuple(row.contradicted_by.split())
+    return Standing(*counted, row.surveyed_share, row.photograph_count, witnesses)
 
 
 def retirement(row: Row[Any]) -> Retirement | None:

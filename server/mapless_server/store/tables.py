@@ -12,6 +12,7 @@ from sqlalchemy import (
     PrimaryKeyConstraint,
     String,
     Table,
+    Text,
     UniqueConstraint,
     text,
 )
@@ -137,9 +138,10 @@ reference_standing = Table(
     "reference_standing",
     metadata,
     _reference_key(),
-    # Photographs in a row that should show what it shows, and do not; at most one an hour counts.
+    # Photographs in a row that should show what it shows, and do not; each holder of a token counts once a day.
     Column("contradiction_count", Integer, nullable=False, server_default=_NONE_YET),
     Column("contradiction_time_us", BigInteger, nullable=False, server_default=_NONE_YET),
+    Column("contradicted_by", Text, nullable=False, server_default=text("''")),  # "DAY:HOLDER", separated by spaces
     # Of a surveyed one: the share of matches with surveyed references in photographs of its place, a running mean.
     Column("surveyed_share", Double),
     Column("photograph_count", Integer, nullable=False, server_default=_NONE_YET),

@@ -6,6 +6,7 @@ can be counted. A third localization, of what the second did not explain, must n
 else a thing that was moved, as a poster, would take a photograph of another place along.
 """
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +19,12 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, RigidTransform, rotation_angle_deg
 from mapless.scenes import AdoptionPolicy
 from mapless_server.bounds import check_bounds
+from mapless_server.security import Principal, Role
 from mapless_server.store.records import Standing
+
+DAY_US = 24 * 3600 * 1_000_000
+MOST_WITNESSES = 100
+"""Contradictions whose days and holders are remembered."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +43,9 @@ class AdoptionOptions:
             so near, a share of the distance to what it shows, should show what that shows.
         contradicting_share: such a photograph contradicts the reference where it has a smaller share of its matches
             with it, and agrees where it has twice that.
-        contradictions: contradictions in a row after which a reference is retired.
-        interval_s: time after a contradiction in which no other one counts, so that one visitor cannot retire any.
+        contradictions, contradicting_days, contradicting_holders: contradictions in a row after which a reference is
+            retired, least days on which they came, and least holders of tokens from whom. Each holder counts once a
+            day. A holder who may change the scene could delete the reference, and needs no other.
     """
 
     min_matches: int = 30
@@ -53,16 +60,15 @@ class AdoptionOptions:
     same_viewpoint_share: float = 0.15
     contradicting_share: float = 0.05
     contradictions: int = 5
-    interval_s: float = 3600.0
+    contradicting_days: int = 3
+    contradicting_holders: int = 2
 
     def __post_init__(self) -> None:
-        check_bounds(
-            self, "min_matches min_vouchers voucher_matches remembered least_photographs contradictions", at_least=1
-        )
+        counts = "min_matches min_vouchers voucher_matches remembered least_photographs"
+        check_bounds(self, f"{counts} contradictions contradicting_days contradicting_holders", at_least=1)
         check_bounds(self, "min_novelty first_usefulness contradicting_share", at_least=0, at_most=1)
         check_bounds(self, "explained_share same_viewpoint_share", above=0, at_most=1)
         check_bounds(self, "same_viewpoint_deg", above=0, at_most=180)
-        check_bounds(self, "interval_s", at_least=0)
 
 
 class Refusal(str, Enum):
@@ -202,17 +208,41 @@ def is_outdated(standing: Standing, policy: AdoptionPolicy, options: AdoptionOpt
     return share is not None and count >= options.least_photographs and share < policy.min_surveyed_share
 
 
-def with_photograph(standing: Standing, share: float, now_us: int, options: AdoptionOptions) -> Standing:
+def holder_of(principal: Principal) -> str:
+    """Short name of a caller for `with_photograph`; empty for one who may change scenes."""
+    if principal.role >= Role.WRITE:
+        return ""
+    return hashlib.sha256("/".join(principal.holder).encode()).hexdigest()[:16]
+
+
+def with_photograph(standing: Standing, share: float, now_us: int, holder: str, options: AdoptionOptions) -> Standing:
     """What is known of a reference after a photograph that should show what it shows has this share of matches with it.
 
-    Contradictions in a row are counted, one in each interval; a photograph that agrees ends the row.
+    Contradictions in a row are counted, one of each holder a day (UTC); a photograph that agrees ends the row.
     """
     if share >= 2 * options.contradicting_share:
-        return replace(standing, contradiction_count=0)
-    is_counted = now_us - standing.contradiction_time_us >= 1e6 * options.interval_s
-    if share >= options.contradicting_share or not is_counted:
+        return replace(standing, contradiction_count=0, contradicted_by=())
+    witness = f"{now_us // DAY_US}:{holder}"
+    if share >= options.contradicting_share or witness in standing.contradicted_by:
         return standing
-    return replace(standing, contradiction_count=standing.contradiction_count + 1, contradiction_time_us=now_us)
+    return replace(
+        standing,
+        contradiction_count=standing.contradiction_count + 1,
+        contradiction_time_us=now_us,
+        contradicted_by=(*standing.contradicted_by, witness)[-MOST_WITNESSES:],
+    )
+
+
+def is_contradicted(standing: Standing, options: AdoptionOptions) -> bool:
+    """Whether photographs contradict a reference so often, on so many days and from so many holders that it retires."""
+    days = {it.partition(":")[0] for it in standing.contradicted_by}
+    holders = {it.partition(":")[2] for it in standing.contradicted_by}
+    are_enough = "" in holders or len(holders) >= options.contradicting_holders
+    return (
+        are_enough
+        and len(days) >= options.contradicting_days
+        and standing.contradiction_count >= options.contradictions
+    )
 
 
 def with_usefulness(usefulness: float, share: float, options: AdoptionOptions) -> float:

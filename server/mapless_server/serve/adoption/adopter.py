@@ -33,7 +33,7 @@ from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scheduling import Flow
-from mapless_server.security import SceneKey
+from mapless_server.security import Principal, SceneKey
 from mapless_server.services.messages.answers import AnswerFrames, outcome_to_message
 from mapless_server.store import NewReference, RetirementReason, Store, adoption, time_us
 from mapless_server.store.records import Adopted, Standing
@@ -66,11 +66,13 @@ class Candidate:
         query: as it was asked.
         answered: its answer.
         inliers_px: (M, 2) the keypoints of the matches that agree with it, pixels of the photograph as it was sent.
+        holder: its caller, see `policy.holder_of`.
     """
 
     query: Query
     answered: Evidence
     inliers_px: Array
+    holder: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +128,14 @@ class Adopter:
         """Photographs that wait to be considered."""
         return len(self._waiting)
 
-    def offer(self, request: pb.LocalizeRequest, response: pb.LocalizeResponse, query: Query, result: Result) -> None:
+    def offer(
+        self,
+        request: pb.LocalizeRequest,
+        response: pb.LocalizeResponse,
+        query: Query,
+        result: Result,
+        principal: Principal,
+    ) -> None:
         """Remembers an answered photograph that may be adopted; called on the event loop, after the answer is made."""
         policy, asked = result.attributes.adoption, request.options
         if policy is None or not asked.allow_adoption or asked.confidential or query.reference_ids or query.scenes:
@@ -142,7 +151,12 @@ class Adopter:
             self._observer.count("adoptions", 1, "queue")
             return
         self._waiting.append(
-            Candidate(replace(query, photo=replace(query.photo, depth=None)), evidence, inliers_px(result))
+            Candidate(
+                replace(query, photo=replace(query.photo, depth=None)),
+                evidence,
+                inliers_px(result),
+                rules.holder_of(principal),
+            )
         )
         self._waiting_bytes += size_bytes
         self._arrived.set()
@@ -318,15 +332,17 @@ class Adopter:
         self, candidate: Candidate, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
     ) -> None:
         """Counts what a photograph says of the surveyed references that should show what it shows, and retires some."""
+        if candidate.query.photo.mask:  # what does not show a reference may be all that the mask has left
+            return
         scene_key, now_us = candidate.query.scene_key, time_us(self._now())
         shares = await self._shares(candidate.query, place, surveyed, result, options)
         standings = await asyncio.to_thread(
             adoption.change_standings,
             self._store.database,
             shares,
-            lambda key, it: rules.with_photograph(it, shares[key], now_us, options),
+            lambda key, it: rules.with_photograph(it, shares[key], now_us, candidate.holder, options),
         )
-        contradicted = [key for key, it in standings.items() if it.contradiction_count >= options.contradictions]
+        contradicted = [key for key, it in standings.items() if rules.is_contradicted(it, options)]
         await self._retire(scene_key, contradicted, RetirementReason.CONTRADICTED)
 
     async def _adopted(self, candidate: Candidate) -> list[Adopted]:

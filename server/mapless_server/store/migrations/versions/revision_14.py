@@ -30,6 +30,7 @@ def upgrade() -> None:
         key(),
         sa.Column("contradiction_count", sa.Integer, nullable=False, server_default=none_yet),
         sa.Column("contradiction_time_us", sa.BigInteger, nullable=False, server_default=none_yet),
+        sa.Column("contradicted_by", sa.Text, nullable=False, server_default=sa.text("''")),
         sa.Column("surveyed_share", sa.Double),
         sa.Column("photograph_count", sa.Integer, nullable=False, server_default=none_yet),
         sa.Column("retire_time_us", sa.BigInteger),
