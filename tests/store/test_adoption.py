@@ -12,6 +12,7 @@ from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, RetirementReason, SceneAttributes, Store, adoption
 from mapless_server.store.pairs import PairStore, Progress
+from mapless_server.store.portions import IndexReader
 from mapless_server.store.records import Standing
 
 HALL = SceneKey("hall")
@@ -203,3 +204,13 @@ def test_the_background_leaves_retired_references_alone(place: Place) -> None:
         claim = pairs.claim("nearest", progress)
         assert claim is not None
         assert claim.reference_id == "a"
+
+
+def test_a_scene_read_in_portions_lacks_retired_references(place: Place) -> None:
+    with place.open() as store:
+        keys, reader = hall(store), IndexReader(store.database)
+        adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
+        assert [it.reference_id for it in reader.read_portion(HALL, "", 10, "vlad").references] == ["b"]
+        assert reader.read_state(HALL).reference_count == 1
+        store.restore_reference(HALL, "a")
+        assert [it.reference_id for it in reader.read_portion(HALL, "", 10, "vlad").references] == ["a", "b"]

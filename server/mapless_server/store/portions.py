@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from sqlalchemy import Connection, Select, and_, select
+from sqlalchemy import Connection, Select, and_, func, select
 
 from mapless_server.security import SceneKey
 
 from . import rows, tables
 from .database import Database, unless_damaged
-from .queries import all_rows, find_scene
+from .queries import all_rows, find_scene, is_retired
 from .records import IndexedReference
 
 
@@ -37,7 +37,7 @@ class IndexState:
 
     Attributes:
         create_time_us: when the scene was created, microseconds since 1970.
-        generation, reference_count: of the scene at that moment.
+        generation, reference_count: of the scene at that moment, without retired references.
         last_change: key of the reference that was added or deleted last until the wanted generation; empty if none is
             known. Another history of the scene, as after its database was replaced by a backup, has another one.
     """
@@ -55,7 +55,10 @@ class IndexReader:
         self._database = database
 
     def read_portion(self, scene_key: SceneKey, after_id: str, count: int, descriptor_name: str) -> IndexedPortion:
-        """Reads at most `count` references with ids greater than `after_id`, with the descriptors of a name."""
+        """Reads at most `count` references with ids greater than `after_id`, with the descriptors of a name.
+
+        Without those that are retired.
+        """
         with self._database.read() as connection:
             return _read_portion(connection, scene_key, after_id, count, descriptor_name)
 
@@ -75,7 +78,8 @@ def _read_portion(
     connection: Connection, scene_key: SceneKey, after_id: str, count: int, descriptor_name: str
 ) -> IndexedPortion:
     column, descriptor = tables.reference.c, tables.global_descriptor.c
-    chosen = select(column.reference_id, column.key).where(column.scene_id == scene_key, column.reference_id > after_id)
+    is_wanted = and_(column.scene_id == scene_key, column.reference_id > after_id, ~is_retired(column.key))
+    chosen = select(column.reference_id, column.key).where(is_wanted)
     found = all_rows(connection, chosen.order_by(column.reference_id).limit(count))
     if not found:
         return IndexedPortion((), (), "")
@@ -84,9 +88,7 @@ def _read_portion(
     ).outerjoin(
         tables.global_descriptor, and_(descriptor.reference_key == column.key, descriptor.name == descriptor_name)
     )
-    of_scene = indexed.where(
-        column.scene_id == scene_key, column.reference_id > after_id, column.reference_id <= found[-1].reference_id
-    ).order_by(column.reference_id)
+    of_scene = indexed.where(is_wanted, column.reference_id <= found[-1].reference_id).order_by(column.reference_id)
 
     def read_each() -> list[Any]:
         each = (partial(all_rows, connection, indexed.where(column.key == it.key)) for it in found)
@@ -115,4 +117,9 @@ def _read_state(connection: Connection, scene_key: SceneKey, until_generation: i
     )
     last = (connection.execute(it.limit(1)).first() for it in (last_added, last_removed))
     _, last_change = max((tuple(it) for it in last if it is not None), default=(0, ""))
-    return IndexState(scene.create_time_us, scene.generation, scene.reference_count, last_change)
+    standing = tables.reference_standing
+    of_scene = standing.join(tables.reference, standing.c.reference_key == added.key)
+    retired = select(func.count()).select_from(of_scene).where(added.scene_id == scene_key)
+    retired_count = connection.scalar(retired.where(standing.c.retire_time_us.is_not(None))) or 0
+    count = scene.reference_count - retired_count
+    return IndexState(scene.create_time_us, scene.generation, count, last_change)
