@@ -211,7 +211,14 @@ def test_scenes_beyond_a_geo_position_cost_no_conversion(monkeypatch: pytest.Mon
     assert (len(everywhere.questions), everywhere.beyond) == (2_000, None)
 
 
-@pytest.mark.parametrize("fields", [{"geo_position_prior": GEO}, {"position_prior": NEAR, "prior_scene": "scenes/s0"}])
+SURE = GEO | {"horizontal_sigma_m": 1e-4, "height_m": 450.0, "vertical_sigma_m": 1e6}
+"""In a scene's world, horizontally less certain: its directions differ by MIN_SIGMA_RATIO at most."""
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"geo_position_prior": GEO}, {"geo_position_prior": SURE}, {"position_prior": NEAR, "prior_scene": "scenes/s0"}],
+)
 def test_a_scene_with_a_reference_that_is_likely_is_kept(fields: dict[str, Any]) -> None:
     assert HALL.datum is not None
     generator = np.random.default_rng(3)

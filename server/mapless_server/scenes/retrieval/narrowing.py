@@ -49,15 +49,29 @@ class Ellipsoid:
     position: Array
     covariance: Array
 
-    def keeps(self, centres: Array, margin_m: float | Array) -> NDArray[np.bool_]:
-        """Mask (N,) of the centres (N, 3) in the ellipsoid with each half-axis longer by the margin.
-
-        The margin is one for all centres, or each has its own (N,).
-        """
-        variances, axes = np.linalg.eigh(self.covariance)
-        half_axes_m = REACH_SIGMA * np.sqrt(variances.clip(min=0)) + np.asarray(margin_m)[..., None]
-        away = (centres - self.position) @ axes / half_axes_m
+    def keeps(self, centres: Array, margin_m: float) -> NDArray[np.bool_]:
+        """Mask (N,) of the centres (N, 3) in the ellipsoid with each half-axis longer by the margin."""
+        half_axes_m, away_m = self._away(centres, margin_m)
+        away = away_m / half_axes_m
         return np.asarray(np.einsum("ij,ij->i", away, away) <= 1)
+
+    def reaches(self, centres: Array, radii_m: Array, margin_m: float) -> NDArray[np.bool_]:
+        """Mask (N,) of the spheres that may contain a centre that `keeps` keeps, by centres (N, 3) and radii (N,).
+
+        The others are apart from the longer ellipsoid along one of its axes, or along the line from its centre. A few
+        that are apart from it in no such direction are kept, too.
+        """
+        half_axes_m, away_m = self._away(centres, margin_m)
+        lengths_m = np.linalg.norm(away_m, axis=1)
+        along = away_m / np.maximum(lengths_m, np.finfo(float).tiny)[:, None]
+        is_apart = lengths_m > np.linalg.norm(half_axes_m * along, axis=1) + radii_m
+        is_apart |= (np.abs(away_m) > half_axes_m + radii_m[:, None]).any(axis=1)
+        return np.asarray(~is_apart)
+
+    def _away(self, centres: Array, margin_m: float) -> tuple[Array, Array]:
+        """Half-axes (3,) longer by the margin, and the vectors (N, 3) from the centre along these axes, metres."""
+        variances, axes = np.linalg.eigh(self.covariance)
+        return REACH_SIGMA * np.sqrt(variances.clip(min=0)) + margin_m, (centres - self.position) @ axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,13 +191,12 @@ class Narrowing:
 
         All true where no sphere is within the limits; likely values hold among those that are, as far as any is likely.
         """
-        margins_m = self.margin_m + radii_m
         kept = np.ones(len(centres), bool)
         if self.position is not None:
-            kept &= self.position.keeps(centres, margins_m)
+            kept &= self.position.keeps(centres, self.margin_m + radii_m)
         likely = kept.copy()
         for position in self.likely_positions:
-            likely &= position.keeps(centres, margins_m)
+            likely &= position.reaches(centres, radii_m, self.margin_m)
         return next((it for it in (likely, kept) if it.any()), np.ones(len(centres), bool))
 
 

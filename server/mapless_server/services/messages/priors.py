@@ -113,9 +113,14 @@ def _geo_position(message: pb.GeoPositionPrior, attributes: SceneAttributes, fie
         height_m, vertical_sigma_m = message.height_m, message.vertical_sigma_m
     place = GeoPosition(message.latitude_deg, message.longitude_deg, height_m)
     rotation = world_from_enu_at(place, datum).rotation
-    sigmas_m = np.array([message.horizontal_sigma_m] * 2 + [vertical_sigma_m])
-    covariance = rotation @ np.diag(sigmas_m.clip(min=MIN_SIGMA_RATIO * sigmas_m.max()) ** 2) @ rotation.T
+    covariance = rotation @ _enu_covariance(message.horizontal_sigma_m, vertical_sigma_m) @ rotation.T
     return PositionPrior(world_from_geodetic(place, datum), (covariance + covariance.T) / 2)
+
+
+def _enu_covariance(horizontal_sigma_m: float, vertical_sigma_m: float) -> Array:
+    """Covariance (3, 3) in east, north and up, square metres; see `MIN_SIGMA_RATIO`."""
+    sigmas_m = np.array([horizontal_sigma_m, horizontal_sigma_m, vertical_sigma_m])
+    return np.diag(sigmas_m.clip(min=MIN_SIGMA_RATIO * sigmas_m.max()) ** 2)
 
 
 def _check_geo_position(message: pb.GeoPositionPrior, field: str) -> None:
@@ -135,8 +140,11 @@ def narrowing_at_place(message: pb.GeoPositionPrior, field: str) -> tuple[Narrow
     Without a height every one is likely, and that of the frame is 0. FieldError if a value is out of range.
     """
     _check_geo_position(message, field)
-    vertical_sigma_m = message.vertical_sigma_m if message.HasField("height_m") else MAX_SIGMA_M
-    covariance = np.diag([message.horizontal_sigma_m**2, message.horizontal_sigma_m**2, vertical_sigma_m**2])
+    if message.HasField("height_m"):
+        covariance = _enu_covariance(message.horizontal_sigma_m, message.vertical_sigma_m)
+    else:
+        covariance = _enu_covariance(message.horizontal_sigma_m, UNKNOWN_HEIGHT_SIGMA_M)
+        covariance[2, 2] = MAX_SIGMA_M**2
     likely = Narrowing.of(Priors(position=PositionPrior(np.zeros(3), covariance)))
     return likely, Datum(message.latitude_deg, message.longitude_deg, message.height_m)
 
