@@ -1,8 +1,9 @@
 """Scenes in memory: references with their features, retrieval indexes, audits.
 
 May import store, security, method, networks and images. Begin with `library` (loads references), `indexes` and
-`retrieval` (choose references), `background` (matches references ahead of queries), `audit`, `plausibility` and
-`depth_checks`. The package itself has the values that other rooms exchange with it.
+`retrieval` (choose references), `background` (matches references ahead of queries), `audit`, `plausibility`,
+`depth_checks` and `adoption` (which photographs become references). The package itself has the values that other rooms
+exchange with it.
 """
 
 from .audit.verdict import AuditVerdict, Coverage, CoverageVerdict, ReferenceAudit, Viewpoint
