@@ -23,6 +23,7 @@ from support.servers import CAMERA, StandInDescriptor, StandInExtractor, pose
 from support.stores import damage
 from support.waiting import wait_until
 
+from mapless_server.errors import NotFound
 from mapless_server.method.options import StageContext
 from mapless_server.scenes import index_files
 from mapless_server.scenes.index_files import IndexFileOptions, IndexFiles, again_if_damaged
@@ -194,6 +195,40 @@ class TestUse:
         restarted.of_scenes.entries(SceneKey("t"), StageContext())
         wait_until(lambda: restarted.of_scenes.entries(SceneKey("t"), StageContext()).file is not None)
         assert file_in(tmp_path / "other").name == restarted.files._path(SceneKey("t")).name
+
+    def test_it_is_deleted_where_another_server_deletes_the_scene(
+        self, serve: Serve, store: Store, tmp_path: Path
+    ) -> None:
+        server = serve()
+        server.filed()
+        store.delete_scene(SCENE)
+        with pytest.raises(NotFound):
+            server.entries()
+        assert not list(tmp_path.rglob("*.index"))
+
+    def test_it_is_deleted_if_the_scene_is_while_it_is_made(
+        self, serve: Serve, store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        made = threading.Event()
+
+        def written(*given: Any) -> None:
+            index_writer.write_index(*given)
+            store.delete_scene(SCENE)
+            made.set()
+
+        monkeypatch.setattr(index_files, "write_index", written)
+        serve().entries()
+        assert made.wait(30)
+        wait_until(lambda: not list(tmp_path.rglob("*.index")))
+
+    def test_what_a_killed_process_has_left_is_deleted(self, serve: Serve, tmp_path: Path) -> None:
+        server = serve()
+        server.filed()
+        left = next(tmp_path.rglob("*.index")).with_name("0123.part")
+        left.write_bytes(b"some rows")
+        server.files._delete_abandoned()
+        assert not left.exists()
+        server.filed()
 
     def test_a_damaged_reference_is_as_damaged_as_in_memory(self, serve: Serve, store: Store) -> None:
         damage(store, SCENE, "r9", "descriptor")

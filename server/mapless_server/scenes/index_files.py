@@ -12,9 +12,10 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from hashlib import blake2b
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
@@ -27,7 +28,7 @@ from mapless_server.store.portions import IndexReader
 from .observer import BackgroundObserver
 from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 from .retrieval.index_file import Header, Identity, IndexDamaged, IndexFile, NotThisIndex
-from .retrieval.index_writer import BeingMade, Content, Making, has_room, unfinished, write_index
+from .retrieval.index_writer import UNFINISHED, BeingMade, Content, Making, has_room, unfinished, write_index
 from .retrieval.lists import ListOptions
 
 T = TypeVar("T")
@@ -100,6 +101,7 @@ class IndexFiles:
         self.is_idle = is_idle
         self._store = store
         self._reader = IndexReader(store.database)
+        self._store_hash = blake2b(store.database.name.encode(), digest_size=16).hexdigest()
         self._descriptor = descriptor
         self._folder = folder
         self._observer = observer or BackgroundObserver()
@@ -213,7 +215,7 @@ class IndexFiles:
 
     def _identity_of(self, scene_key: SceneKey, create_time_us: int) -> Identity:
         name, dimension = self._descriptor.name, self._descriptor.dimension
-        return Identity(self._store.database.name, scene_key, create_time_us, name, dimension)
+        return Identity(self._store_hash, scene_key, create_time_us, name, dimension)
 
     def _current(self, scene_key: SceneKey, file: IndexFile) -> Read:
         """The index of a file with what has changed since; NotThisIndex if the store has had another history."""
@@ -236,13 +238,10 @@ class IndexFiles:
         return index, damaged_ids
 
     def _run(self) -> None:
-        is_tidy = False
         while (wanted := self._wanted.get()) is not None and not self._closing.is_set():
             scene_key, adopt = wanted
             try:
-                if not is_tidy:
-                    self._delete_abandoned()
-                    is_tidy = True
+                self._delete_abandoned()
                 self._make(scene_key, adopt)
             except _Closing:
                 return
@@ -281,6 +280,8 @@ class IndexFiles:
                 opened = self.open(scene_key)
         if opened is not None:
             adopt(opened[0])
+        else:
+            self._discard_of_deleted(scene_key)
 
     def _unfinished(self, scene_key: SceneKey) -> AbstractContextManager[BinaryIO]:
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -321,15 +322,28 @@ class IndexFiles:
         self._step_begin_s = time.monotonic()
 
     def _delete_abandoned(self) -> None:
-        """Deletes the files of scenes of this store that do not exist any more."""
+        """Deletes files of scenes of this store that do not exist any more, and what killed processes have left."""
         for path in self._folder.glob("*.index"):
             header = _header_of(path)
-            if header is None or header.identity.store != self._store.database.name:
+            if header is None or header.identity.store != self._store_hash:
                 continue
-            try:
-                self._store.get_generation(SceneKey(header.identity.scene))
-            except NotFound:
+            if not self._exists(SceneKey(header.identity.scene)):
                 path.unlink(missing_ok=True)
+        for path in self._folder.glob(f"*{UNFINISHED}"):
+            with suppress(BeingMade), unfinished(path):
+                pass
+
+    def _discard_of_deleted(self, scene_key: SceneKey) -> None:
+        """Deletes the file of a scene that was deleted while it was made."""
+        if not self._exists(scene_key):
+            self.discard(scene_key)
+
+    def _exists(self, scene_key: SceneKey) -> bool:
+        try:
+            self._store.get_generation(scene_key)
+        except NotFound:
+            return False
+        return True
 
 
 def _version_of(path: Path) -> tuple[int, int] | None:

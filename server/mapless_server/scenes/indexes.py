@@ -245,9 +245,11 @@ class SceneIndexes:
     def _refresh(self, scene_key: SceneKey, cached: _CachedIndex) -> Entries:
         try:
             entries = cached.refresh(self._store, scene_key, self._descriptor.name)
-        except Exception:
-            # An index that cannot be updated is not valid, and that of a deleted scene wastes memory.
+        except Exception as error:
+            # An index that cannot be updated is not valid, and that of a deleted scene wastes memory and disk.
             self._discard_damaged(scene_key, cached)
+            if isinstance(error, NotFound) and self._files is not None:  # another server has deleted it
+                self._files.discard(scene_key)
             with self._lock:
                 self._cached.forget(lambda _, it: it is cached)
             raise

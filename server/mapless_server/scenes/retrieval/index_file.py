@@ -71,7 +71,7 @@ class Identity:
     """The scene and the descriptor that an index is of.
 
     Attributes:
-        store: name of the database.
+        store: hash of the database's name.
         scene: key of the scene.
         create_time_us: when it was created, microseconds since 1970; another scene of the same key has another.
         descriptor: name of the global descriptor.
@@ -120,8 +120,10 @@ class Header:
     parts: Mapping[str, Part]
 
     def encode(self) -> bytes:
-        """The header as it stands in the file."""
+        """The header as it stands in the file; ValueError if there is no room for it."""
         text = json.dumps(asdict(self)).encode()
+        if PREFIX.size + len(text) > HEADER_BYTES:
+            raise ValueError(f"the header of an index has at most {HEADER_BYTES} bytes, not {PREFIX.size + len(text)}")
         return PREFIX.pack(MAGIC, VERSION, len(text), zlib.crc32(text)) + text
 
     @staticmethod

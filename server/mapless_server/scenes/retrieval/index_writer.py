@@ -91,6 +91,10 @@ def has_room(folder: Path, count: int, dimension: int) -> bool:
     return shutil.disk_usage(folder).free > 4 * count * (dimension + _BYTES_BESIDE_ROW)
 
 
+UNFINISHED = ".part"
+"""Ending of the name of a file that is being made."""
+
+
 @contextmanager
 def unfinished(path: Path) -> Iterator[BinaryIO]:
     """An empty file for the index of a path, which one process has at a time; deleted at the end unless it is finished.
@@ -115,7 +119,7 @@ def unfinished(path: Path) -> Iterator[BinaryIO]:
 
 
 def _unfinished(path: Path) -> Path:
-    return path.with_suffix(".part")
+    return path.with_suffix(UNFINISHED)
 
 
 @dataclass(eq=False)
