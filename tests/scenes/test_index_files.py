@@ -36,7 +36,9 @@ from mapless_server.scenes.retrieval.lists import ListOptions
 from mapless_server.scenes.retrieval.ranking import Selection, rank_references
 from mapless_server.security import SceneKey
 from mapless_server.store import NewReference, Store
+from mapless_server.store.adoption import retire
 from mapless_server.store.portions import IndexedPortion, IndexReader
+from mapless_server.store.records import RetirementReason
 
 SCENE = SceneKey("s")
 EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
@@ -139,6 +141,22 @@ class TestUse:
             assert ranked[0].reference_id == f"r{i}"
             assert f"r{i - 60}" not in {it.reference_id for it in ranked}
         assert indexes.entries().file is not None
+
+    def test_a_retired_one_is_not_found_until_it_is_restored(self, serve: Serve, store: Store) -> None:
+        indexes = serve()
+        indexes.filed()
+        retire(store, SCENE, [store.get_reference(SCENE, "r7").key], RetirementReason.CONTRADICTED)
+        for it in (indexes, serve()):
+            entries = it.entries()
+            assert entries.file is not None
+            assert "r7" not in entries
+        made = serve(options=replace(OPTIONS, longest_kept_s=0.0))
+        wait_until(lambda: made.entries().changed_counts() == (0, 0))
+        assert len(made.filed()) == 59
+        store.restore_reference(SCENE, "r7")
+        for it in (indexes, made, serve()):
+            assert "r7" in it.entries()
+            assert len(it.entries()) == 60
 
     def test_a_deleted_and_added_one_is_the_new_one(self, serve: Serve, store: Store) -> None:
         indexes = serve()

@@ -7,7 +7,9 @@ from support.stores import Place, make_reference
 from mapless_server.errors import NotFound
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
+from mapless_server.store.adoption import retire
 from mapless_server.store.portions import IndexReader
+from mapless_server.store.records import RetirementReason
 
 SCENE, OTHER, DESCRIPTOR = SceneKey("a"), SceneKey("b"), "vlad"
 
@@ -19,8 +21,9 @@ def fill(store: Store, scene_key: SceneKey, count: int) -> None:
 
 
 def test_portions_are_the_scene_in_the_order_of_ids(store: Store, place: Place) -> None:
-    fill(store, SCENE, 7)
+    fill(store, SCENE, 8)
     fill(store, OTHER, 3)
+    retire(store, SCENE, [store.get_reference(SCENE, "r7").key], RetirementReason.CONTRADICTED)
     r3, r5 = (store.get_reference(SCENE, it).key for it in ("r3", "r5"))
     place.execute("UPDATE global_descriptor SET sha256 = 'wrong' WHERE reference_key = ?", r3)
     place.execute("UPDATE reference SET geometry_sha256 = 'wrong' WHERE key = ?", r5)
@@ -51,6 +54,9 @@ def test_the_last_change_until_a_generation_stays_the_same(store: Store) -> None
     gone = store.delete_reference(SCENE, "r0")
     second = reader.read_state(SCENE)
     assert (second.reference_count, second.last_change) == (1, gone)
+    retired = retire(store, SCENE, [store.get_reference(SCENE, "r1").key], RetirementReason.CONTRADICTED)
+    third = reader.read_state(SCENE)
+    assert (third.reference_count, [third.last_change]) == (0, retired)
     fill(store, OTHER, 1)
     assert reader.read_state(SCENE, first.generation).last_change == first.last_change
     assert reader.read_state(SCENE, second.generation).last_change == second.last_change
