@@ -1,8 +1,8 @@
 """Properties of a photograph after an attempt, on which the rungs of the ladder depend."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
-from mapless_server.method.judge.hypothesis import Attempt, Doubt
+from mapless_server.method.judge.hypothesis import Doubt
 from mapless_server.method.ladder import Situation
 from mapless_server.method.options import Variant
 from mapless_server.method.promise import UNKNOWN, Known, PromiseOptions
@@ -34,16 +34,22 @@ def situation_of(search: Search, tiers: Sequence[Tier], promise: PromiseOptions)
         any_roll=any_roll_of(tiers),
         angles_deg=search.angles_deg,
         has_depth=search.coarse is not None and search.coarse.prepared.has_depth,
-        other_scene=None if search.group is None else _other_scene(search.group, search.tried, promise),
+        other_scene=None if search.group is None else _other_scene(search, search.group, promise),
         known=_known(search),
         promise=promise,
     )
 
 
-def _other_scene(group: SceneGroup, tried: Collection[Attempt], promise: PromiseOptions) -> int | None:
-    """The next scene, if its matches show so much that at least the cheapest rung would be worth its time in it."""
-    rank = group.next_scene(tried)
-    return rank if rank is not None and Known(group.ranking[rank].agreement).is_worth(CHEAPEST, promise) else None
+def _other_scene(search: Search, group: SceneGroup, promise: PromiseOptions) -> int | None:
+    """The next scene, if its matches show so much that at least the cheapest rung would be worth its time in it.
+
+    Where two places of the present scene explain the photograph, that one must be a rival of these.
+    """
+    rank, own = group.next_scene(search.tried), search.own
+    if rank is None or not Known(group.ranking[rank].agreement).is_worth(CHEAPEST, promise):
+        return None
+    has_poses = own is not None and bool(own.doubts & Doubt.TWO_PLACES)
+    return rank if not has_poses or group.ranking[rank].may_rival(group.ranking[search.attempt.scene]) else None
 
 
 def _known(search: Search) -> Known:
