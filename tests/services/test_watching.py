@@ -7,6 +7,7 @@ import weakref
 import pytest
 
 from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.query import TRYING
 from mapless_server.errors import Overloaded
 from mapless_server.security import key_of
 from mapless_server.services.watching import MAX_WATCHERS, MAX_WATCHERS_OF_TENANT, QUEUE_LENGTH, Watcher, Watchers
@@ -104,3 +105,38 @@ async def test_all_tenants_share_a_limit() -> None:
     assert refused.value.retry_after_s is not None
     await watches[0].aclose()
     watchers.watch(HALL)
+
+
+async def test_a_watcher_does_not_learn_that_other_scenes_were_tried() -> None:
+    """All that an answer among scenes can say of others, and of its own what is left."""
+    watchers, among = Watchers(True), pb.LocalizeResponse(scene="scenes/hall")
+    watch = watchers.watch(HALL)
+    among.rejection.message = "poses in two scenes explain the photograph: one in 'hall', one in 'other'"
+    for scene in ("scenes/hall", "scenes/other"):
+        among.rejection.hypotheses.add(scene=scene)
+        among.diagnostics.scenes.add(scene=scene)
+    among.rejection.hint.message = f"Look around. {TRYING} in another scene was not finished: asking again may help."
+    among.diagnostics.searched_scene_count = 2
+    for rung, chosen in (("as it is", False), ("other scene", True), ("wide", False)):
+        among.diagnostics.attempts.add(rung=rung, features="sift", chosen=chosen)
+        among.diagnostics.ladder_cuts.add(rung=rung)
+    for stage in ("retrieval", "scenes", "coarse", "sift/scenes"):
+        among.diagnostics.stages.add(stage=stage)
+    watchers.publish(HALL, REQUEST, among, None)
+    seen = (await next_of(watch)).answer
+    expected = pb.LocalizeResponse(scene="scenes/hall")
+    expected.rejection.message = "several poses explain the photograph"
+    expected.rejection.hypotheses.add(scene="scenes/hall")
+    expected.rejection.hint.message = "Look around."
+    expected.diagnostics.searched_scene_count = 1
+    assert seen == expected
+
+
+async def test_a_watcher_sees_all_attempts_in_a_named_scene() -> None:
+    watchers, named = Watchers(True), answer(3)
+    watch = watchers.watch(HALL)
+    named.diagnostics.searched_scene_count = 1
+    named.diagnostics.attempts.extend([pb.Attempt(rung="as it is"), pb.Attempt(rung="wide", chosen=True)])
+    named.diagnostics.ladder_cuts.add(rung="mirrored")
+    watchers.publish(HALL, REQUEST, named, None)
+    assert (await next_of(watch)).answer == named

@@ -101,6 +101,9 @@ TRACK = "track"
 MIRROR = "mirror"
 """The stage of comparing a photograph that was not localized, and its mirror image, with references."""
 
+TRYING = "Trying it"
+"""Begins the last sentence of a hint, which says what was not finished."""
+
 MAX_TRACKED_SIGMA_DEG = 20.0
 """Priors of a less certain rotation do not say what the photograph shows."""
 

@@ -17,7 +17,7 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.scenes import ANYWHERE, Choice
 
 from . import tracking
-from .query import CutReason, LadderCut, Result, Tier, Tried
+from .query import TRYING, CutReason, LadderCut, Result, Tier, Tried
 from .search import UNFINISHED, Search
 
 
@@ -140,7 +140,7 @@ def _with_unfinished(answer: Answer, attempts: Sequence[Tried], cuts: Sequence[L
     advice = "asking again, when less is asked, may help."
     if lacking:
         advice = "the scene's references still lack evidence, made in the background; asking again later may help."
-    advice = f"Trying it {untried} was not finished: {advice}"
+    advice = f"{TRYING} {untried} was not finished: {advice}"
     hint = replace(rejection.hint, message=f"{rejection.hint.message} {advice}")
     return replace(answer, outcome=replace(rejection, hint=hint))
 

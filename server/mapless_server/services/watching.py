@@ -13,6 +13,7 @@ from collections.abc import Awaitable, Callable
 
 from mapless.v1 import geometry_pb2 as geometry_pb
 from mapless.v1 import localization_service_pb2 as pb
+from mapless_server.engine.query import TRYING
 from mapless_server.errors import FailedPrecondition, Overloaded, Unavailable
 from mapless_server.security import SceneKey, tenant_of
 
@@ -159,12 +160,20 @@ class Watchers:
 
 
 def _remove_other_scenes(answer: pb.LocalizeResponse) -> None:
-    """Removes what an answer says of other scenes than its own."""
-    answer.diagnostics.ClearField("scenes")
-    answer.diagnostics.searched_scene_count = 1
-    hypotheses = answer.rejection.hypotheses
-    if answer.HasField("rejection") and any(it.scene != answer.scene for it in hypotheses):
-        its = [it for it in hypotheses if it.scene == answer.scene]
-        del hypotheses[:]
-        hypotheses.extend(its)
-        answer.rejection.message = "poses in several scenes explain the photograph"
+    """Removes what an answer among several scenes says of others than its own, and that there are others.
+
+    Which scene an attempt, a cut or the time of a stage was of is not known here, so none is left.
+    """
+    diagnostics, rejection = answer.diagnostics, answer.rejection
+    if diagnostics.searched_scene_count <= 1:
+        return
+    for name in ("scenes", "attempts", "ladder_cuts", "stages"):
+        diagnostics.ClearField(name)
+    diagnostics.searched_scene_count = 1
+    if rejection.HasField("hint"):  # which may say what was not tried
+        rejection.hint.message = rejection.hint.message.partition(f" {TRYING}")[0]
+    its = [it for it in rejection.hypotheses if it.scene == answer.scene]
+    if len(its) < len(rejection.hypotheses):
+        del rejection.hypotheses[:]
+        rejection.hypotheses.extend(its)
+        rejection.message = "several poses explain the photograph"
