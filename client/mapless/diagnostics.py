@@ -33,6 +33,8 @@ class SceneUse:
         similarity: largest similarity of one of them, as of `ReferenceUse`.
         match_count: most matches of the photograph with one of them.
         attempted: whether a pose was looked for in it.
+        agreement: number of matches that agree on one turn, scale and shift of the images, divided by the square root
+            of the number of all, by which scenes are ordered; 0 where no other scene has such references.
     """
 
     scene: str
@@ -40,6 +42,7 @@ class SceneUse:
     similarity: float
     match_count: int
     attempted: bool
+    agreement: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -227,7 +230,8 @@ class Diagnostics:
         missing_evidence: what references lacked for further attempts; asking again later may help.
         depth_check: how the photograph's depth compares with the answer; None without depth, and of a server before
             0.4, which ignores it.
-        scenes: of several scenes, those with references that resemble the photograph most, the best first.
+        scenes: of several scenes, those with references that resemble the photograph most, the best first, by
+            their agreement.
         searched_scene_count: number of scenes in which references were looked for; 0 of a server before 0.4.
     """
 

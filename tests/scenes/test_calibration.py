@@ -13,6 +13,7 @@ from support.scenes import SceneOptions, make_scene, random_for
 from support.servers import StandInDescriptor, StandInExtractor
 from support.stores import Folder, Place, let_pass
 
+import mapless
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.errors import Unavailable
 from mapless_server.method.bundle.estimate import SELF_TAIL_95, TAIL_95, USUAL_GAP, Accuracy, growth
@@ -27,7 +28,7 @@ from mapless_server.scenes.indexes import SceneIndexes
 from mapless_server.scenes.library import Closed, ReferenceLibrary
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, SelfCalibration, Store, calibration_kind
+from mapless_server.store import NewReference, SelfCalibration, Store, adoption, calibration_kind
 
 SCENE = SceneKey("s")
 EXTRACTOR, DESCRIPTOR = StandInExtractor(), StandInDescriptor()
@@ -155,13 +156,17 @@ def store(place: Folder) -> Iterator[Store]:
 
 
 def add(store: Store, references: Sequence[PosedView], change: Change = lambda it: it) -> None:
+    store.add_references(SCENE, new_references(references, change))
+
+
+def new_references(references: Sequence[PosedView], change: Change = lambda it: it) -> list[NewReference]:
     vector = np.zeros(16, np.float32)
     new = []
     for i, it in enumerate(references):
         vector[:2] = np.cos(i / 5), np.sin(i / 5)
         described = {EXTRACTOR.name: it.view}, {DESCRIPTOR.name: vector.copy()}
         new.append(NewReference(f"r{i}", b"%d" % i, it.view.camera, change(it.world_from_camera), *described))
-    store.add_references(SCENE, new)
+    return new
 
 
 def similar(scale: float) -> Change:
@@ -267,6 +272,20 @@ class TestScenes:
         found = Server(store).run()
         assert found is not None
         assert found.answer_count == 0
+
+    def test_adopted_ones_are_no_samples(self, store: Store, usual: SelfCalibration) -> None:
+        """The planted errors of the last one, adopted, do not show."""
+        add(store, REFERENCES[:-1])
+        surveyed = Server(store).run()
+        assert surveyed is not None
+        store.update_scene(SCENE, adoption=mapless.AdoptionPolicy())
+        *_, last = new_references(REFERENCES)
+        radii = mapless.Accuracy(0.01, 0.02, 0.1, 0.2)
+        provenance = mapless.Provenance("ADOPTED", radii, 0.5, (mapless.Voucher("r0", 40),))
+        adoption.adopt(store, SCENE, replace(last, provenance=provenance, place_key="place", usefulness=0.2))
+        found = Server(store).run()
+        assert found is not None
+        assert found.answer_count == surveyed.answer_count < usual.answer_count
 
     def test_the_time_is_bounded(self, store: Store) -> None:
         add(store, REFERENCES)

@@ -648,18 +648,20 @@ class Diagnostics(_message.Message):
     def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ..., ladder_cuts: _Optional[_Iterable[_Union[LadderCut, _Mapping]]] = ..., depth_check: _Optional[_Union[DepthCheck, _Mapping]] = ..., missing_evidence: _Optional[_Iterable[_Union[MissingEvidence, _Mapping]]] = ..., scenes: _Optional[_Iterable[_Union[SceneUse, _Mapping]]] = ..., searched_scene_count: _Optional[int] = ...) -> None: ...
 
 class SceneUse(_message.Message):
-    __slots__ = ("scene", "reference_count", "similarity", "match_count", "attempted")
+    __slots__ = ("scene", "reference_count", "similarity", "match_count", "attempted", "agreement")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
     SIMILARITY_FIELD_NUMBER: _ClassVar[int]
     MATCH_COUNT_FIELD_NUMBER: _ClassVar[int]
     ATTEMPTED_FIELD_NUMBER: _ClassVar[int]
+    AGREEMENT_FIELD_NUMBER: _ClassVar[int]
     scene: str
     reference_count: int
     similarity: float
     match_count: int
     attempted: bool
-    def __init__(self, scene: _Optional[str] = ..., reference_count: _Optional[int] = ..., similarity: _Optional[float] = ..., match_count: _Optional[int] = ..., attempted: bool = ...) -> None: ...
+    agreement: float
+    def __init__(self, scene: _Optional[str] = ..., reference_count: _Optional[int] = ..., similarity: _Optional[float] = ..., match_count: _Optional[int] = ..., attempted: bool = ..., agreement: _Optional[float] = ...) -> None: ...
 
 class MissingEvidence(_message.Message):
     __slots__ = ("kind", "name", "reference_count", "made_reference_count")

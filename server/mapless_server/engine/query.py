@@ -321,6 +321,7 @@ class SceneTried:
         match_count: most matches of the photograph with one of them, estimated where a sample of its keypoints shows
             enough; 0 where no other scene has such references.
         attempted: whether a pose was looked for in the scene.
+        agreement: as of `RankedScene`, by which the scenes are ordered.
     """
 
     scene_key: SceneKey
@@ -328,6 +329,7 @@ class SceneTried:
     similarity: float
     match_count: int = 0
     attempted: bool = False
+    agreement: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,7 +85,9 @@ class SceneGroup:
         """The scenes in the order of their ranks, after these attempts."""
         begun = begun_scenes(tried)
         return tuple(
-            SceneTried(it.question.scene_key, it.reference_count, it.similarity, it.match_count, rank in begun)
+            SceneTried(
+                it.question.scene_key, it.reference_count, it.similarity, it.match_count, rank in begun, it.agreement
+            )
             for rank, it in enumerate(self.ranking)
             if it.reference_count
         )

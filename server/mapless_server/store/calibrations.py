@@ -25,7 +25,7 @@ from .pairs import next_try
 from .queries import is_detached
 from .records import SelfCalibration
 from .store import Store
-from .tables import reference, scene, scene_calibration, scene_generation
+from .tables import adopted_reference, reference, scene, scene_calibration, scene_generation
 
 CLAIM_S = 120.0
 """Far longer than one reference takes, also on a busy server; it is renewed after each."""
@@ -109,9 +109,12 @@ def add(
 
 
 def list_newest(database: Database, scene_key: SceneKey, count: int) -> list[str]:
-    """Ids of the references that were added to a scene last, the latest first."""
+    """Ids of the surveyed references that were added to a scene last, the latest first."""
     column = reference.c
-    latest = select(column.reference_id).where(column.scene_id == scene_key)
+    is_adopted = (
+        select(adopted_reference.c.reference_key).where(adopted_reference.c.reference_key == column.key).exists()
+    )
+    latest = select(column.reference_id).where(column.scene_id == scene_key, ~is_adopted)
     with database.read() as connection:
         return list(connection.scalars(latest.order_by(column.generation.desc(), column.key).limit(count)))
 

@@ -11,7 +11,7 @@ from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.features.views import PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.hints import hinted
-from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
 
 SCENE = make_scene(random_for("hints"))
 NAMES = [reference.name for reference in SCENE.references]
@@ -73,6 +73,18 @@ def test_the_advice_follows_from_the_numbers(
     reason: RejectionReason, matches: tuple[int, ...], features: int, advice: Advice
 ) -> None:
     assert hint_of(reason, matches, features).advice is advice
+
+
+def test_two_scenes_are_told_apart_by_naming_one() -> None:
+    hypotheses = tuple(PoseHypothesis(RigidTransform.identity(), 50, (), world=it) for it in ("church", "office"))
+    answer = Answer(
+        Rejection(RejectionReason.AMBIGUOUS, "planted", hypotheses=hypotheses), reference_match_counts=ENOUGH
+    )
+    outcome = hinted(answer, view_of(900), SCENE.references).outcome
+    assert isinstance(outcome, Rejection)
+    assert isinstance(outcome.hint, Hint)
+    assert outcome.hint.message.startswith("Name the scene, narrow the group, ")
+    assert "prior on the pose" in hint_of(RejectionReason.AMBIGUOUS).message
 
 
 def test_the_best_reference_is_the_one_with_counted_matches() -> None:

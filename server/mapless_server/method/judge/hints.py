@@ -113,6 +113,12 @@ def _advice(case: _Case) -> tuple[Advice, str]:
     reason = case.rejection.reason
     if reason is RejectionReason.PRIOR_CONFLICT:
         return Advice.CHECK_PRIOR, "Check the prior: the matches place the camera elsewhere."
+    if reason is RejectionReason.AMBIGUOUS and len({it.world for it in case.rejection.hypotheses}) > 1:
+        return (
+            Advice.TELL_PLACES_APART,
+            "Name the scene, narrow the group, or take a photograph that shows where the two places differ; where both "
+            "scenes have a datum, a position on the Earth decides, too. If both are of one place, delete one of them.",
+        )
     if reason is RejectionReason.AMBIGUOUS:
         return (
             Advice.TELL_PLACES_APART,

@@ -2,11 +2,11 @@
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
-from itertools import chain, zip_longest
+from itertools import chain, islice, zip_longest
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -23,6 +23,7 @@ from mapless_server.method.pipeline import Pipeline, prepare, reconstruct
 from mapless_server.method.rejection import Rejection
 from mapless_server.security import SceneKey
 from mapless_server.store import SelfCalibration, Store
+from mapless_server.store.adoption import list_adopted
 from mapless_server.store.calibrations import (
     CLAIM_S,
     LEAST_REFERENCES,
@@ -89,17 +90,19 @@ class Calibrator:
         pause: Callable[[], None],
         contradicts_itself: bool = False,
         count: int = SAMPLE,
+        adopted: Collection[str] = (),
     ) -> SelfCalibration:
         """Localizes so many references of a scene, and fits the model to the results.
 
-        `newest` are ids of its latest references, the latest first; `pause` is called between the stages of each, and
-        may raise, which ends it. Of fewer than `LENS_REFERENCES` no errors of the lens are sought. In a scene that
+        `newest` are ids of its latest references, the latest first; none of the `adopted` is localized, since their
+        poses were computed from the others. `pause` is called between the stages of each, and may raise, which ends it.
+        Of fewer than `LENS_REFERENCES` no errors of the lens are sought. In a scene that
         `contradicts_itself` none are localized: its poses measure nothing.
         NotFound if there is no such scene (field "scene").
         """
         context = StageContext(pause)
         entries = self._indexes.entries(scene_key, context)
-        sample = [] if contradicts_itself else self._sample(entries, newest, count)
+        sample = [] if contradicts_itself else self._sample(entries, newest, count, adopted)
         shared: list[SharedErrors] = []
         # Few references show errors of a lens that more of them do not.
         results = self._localize(
@@ -137,14 +140,15 @@ class Calibrator:
             context.check()
         return results
 
-    def _sample(self, entries: Entries, newest: Sequence[str], count: int) -> list[str]:
+    def _sample(self, entries: Entries, newest: Sequence[str], count: int, adopted: Collection[str]) -> list[str]:
         """Ids of so many references to leave out: the newest and the worst covered by turns."""
         rows = entries.rows()
         if len(rows) < LEAST_REFERENCES:
             return []
         centres = entries.centres(rows)
         nearest_m = KDTree(centres).query(centres, k=2)[0][:, 1]
-        far = [entries.reference(rows[i])[0] for i in np.argsort(-nearest_m, kind="stable")[:count]]
+        by_distance = (entries.reference(rows[i])[0] for i in np.argsort(-nearest_m, kind="stable"))
+        far = list(islice((it for it in by_distance if it not in adopted), count))
         by_turns = chain.from_iterable(zip_longest([it for it in newest if it in entries], far))
         return [it for it in dict.fromkeys(by_turns) if it is not None][:count]
 
@@ -302,10 +306,11 @@ class SceneCalibrations:
 
     def _localize_references(self, claim: CalibrationClaim, pause: Callable[[], None], count: int) -> SelfCalibration:
         newest = list_newest(self._store.database, claim.scene_key, SAMPLE)
+        adopted = {it.reference_id for it in list_adopted(self._store.database, claim.scene_key)}
         # Of its own, so that references that queries use stay in memory.
         with closing(ReferenceLibrary(self._store.uncached(_CACHE_BYTES), self._depths)) as library:
             is_wrong = self._agreements is not None and self._agreements.known(claim.scene_key).contradicts_itself
-            return self._calibrator.calibrate(claim.scene_key, library, newest, pause, is_wrong, count)
+            return self._calibrator.calibrate(claim.scene_key, library, newest, pause, is_wrong, count, adopted)
 
     def _report_failure(self, claim: CalibrationClaim, error: Exception) -> None:
         wait_s = postpone(self._store.database, claim)
