@@ -121,7 +121,5 @@ def test_a_holder_is_a_token_of_a_tenant() -> None:
     assert rules.holder_of(Principal("acme", Role.WRITE, "operator")) == ""
 
 
-def test_the_least_useful_makes_room() -> None:
-    assert rules.least_useful([0.2, 0.1, 0.3], 4) is None
-    assert rules.least_useful([0.2, 0.1, 0.3], 3) == 1
+def test_usefulness_is_a_running_mean() -> None:
     assert rules.with_usefulness(0.2, 0.0, OPTIONS) == pytest.approx(0.18)

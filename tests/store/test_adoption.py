@@ -40,12 +40,12 @@ def indexed(store: Store, since: int | None = None) -> list[str]:
 def test_what_vouches_for_an_adopted_reference_is_kept(place: Place) -> None:
     with place.open() as store:
         hall(store)
-        adoption.adopt(store, HALL, adopted("new"))
+        adoption.adopt(store, HALL, adopted("new"), 9)
     with place.open() as store:
         assert store.get_reference(HALL, "new").provenance == Provenance("ADOPTED", RADII, 0.5, VOUCHERS)
         assert [it.reference_id for it in store.list_references(HALL, 10, only_adopted=True)] == ["new"]
         assert [it.reference_id for it in store.list_references(HALL, 10)] == ["a", "b", "new"]
-        assert adoption.list_adopting_scenes(store.database) == [HALL]
+        assert adoption.list_adopting_scenes(store.database) == {HALL: store.get_generation(HALL)}
 
 
 def test_nothing_is_adopted_once_the_scene_stops(place: Place) -> None:
@@ -53,7 +53,7 @@ def test_nothing_is_adopted_once_the_scene_stops(place: Place) -> None:
         hall(store)
         store.update_scene(HALL, adoption=None)
         with pytest.raises(adoption.NotAdopted, match="adopts no photographs any more"):
-            adoption.adopt(store, HALL, adopted("new"))
+            adoption.adopt(store, HALL, adopted("new"), 9)
         assert indexed(store) == ["a", "b"]
 
 
@@ -61,24 +61,61 @@ def test_nothing_is_adopted_whose_voucher_was_deleted(place: Place) -> None:
     with place.open() as store:
         hall(store)
         store.delete_reference(HALL, "b")
-        with pytest.raises(adoption.NotAdopted, match="vouches for it was deleted"):
-            adoption.adopt(store, HALL, adopted("new"))
+        with pytest.raises(adoption.NotAdopted, match="vouches for it was deleted or retired"):
+            adoption.adopt(store, HALL, adopted("new"), 9)
+
+
+def test_nothing_is_adopted_whose_voucher_is_retired(place: Place) -> None:
+    with place.open() as store:
+        keys = hall(store)
+        adoption.retire(store, HALL, [keys["b"]], RetirementReason.CONTRADICTED)
+        with pytest.raises(adoption.NotAdopted, match="deleted or retired"):
+            adoption.adopt(store, HALL, adopted("new"), 9)
+
+
+def test_a_full_place_keeps_the_most_useful(place: Place) -> None:
+    """However many servers adopt at once: what leaves is decided in the transaction that adds."""
+    with place.open() as store:
+        hall(store)
+        first = adoption.adopt(store, HALL, adopted("x", 0.1), 2)[0].key
+        adoption.adopt(store, HALL, adopted("y", 0.3), 2)
+        before = store.get_generation(HALL)
+        other = store.uncached()
+        assert adoption.adopt(other, HALL, adopted("z"), 2)[1] == {first}
+        assert [it.reference_id for it in adoption.list_adopted(store.database, HALL)] == ["z", "y"]
+        changes = store.list_changes(HALL, before, "vlad")
+        assert [it.reference_id for it in changes.added] == ["z"]
+        assert changes.removed == {first}
+        assert store.get_scene(HALL).reference_count == 4
+        with pytest.raises(adoption.PlaceFull):
+            adoption.adopt(store, HALL, adopted("w"), 2)
+        assert indexed(store) == ["a", "b", "y", "z"]
+        with pytest.raises(AlreadyExists):  # which does not make room for itself
+            adoption.adopt(store, HALL, adopted("y", 0.9), 2)
+
+
+def test_a_retired_reference_keeps_no_place_full(place: Place) -> None:
+    with place.open() as store:
+        hall(store)
+        key = adoption.adopt(store, HALL, adopted("x", 0.9), 1)[0].key
+        adoption.retire(store, HALL, [key], RetirementReason.VOUCHERS_GONE)
+        assert adoption.adopt(store, HALL, adopted("y"), 1)[1] == frozenset()
 
 
 def test_of_two_servers_one_adopts_a_photograph(place: Place) -> None:
     with place.open() as store:
         hall(store)
         other = store.uncached()
-        adoption.adopt(store, HALL, adopted("same"))
+        adoption.adopt(store, HALL, adopted("same"), 9)
         with pytest.raises(AlreadyExists):
-            adoption.adopt(other, HALL, adopted("same"))
+            adoption.adopt(other, HALL, adopted("same"), 9)
         assert len(adoption.list_adopted(store.database, HALL)) == 1
 
 
 def test_adopted_references_are_listed_by_usefulness(place: Place) -> None:
     with place.open() as store:
         hall(store)
-        keys = {name: adoption.adopt(store, HALL, adopted(name, it)).key for name, it in (("x", 0.3), ("y", 0.1))}
+        keys = {name: adoption.adopt(store, HALL, adopted(name, it), 9)[0].key for name, it in (("x", 0.3), ("y", 0.1))}
         assert [it.reference_id for it in adoption.list_adopted(store.database, HALL)] == ["y", "x"]
         adoption.set_usefulness(store.database, {keys["y"]: 0.5, "gone": 0.1})
         found = adoption.list_adopted(store.database, HALL)
@@ -91,7 +128,7 @@ def test_adopted_references_are_listed_by_usefulness(place: Place) -> None:
 def test_old_adopted_references_expire_and_surveyed_do_not(place: Place) -> None:
     with place.open() as store:
         hall(store)
-        adoption.adopt(store, HALL, adopted("new"))
+        adoption.adopt(store, HALL, adopted("new"), 9)
         now = datetime.now(timezone.utc)
         assert adoption.list_expired(store.database, now - timedelta(hours=1)) == []
         assert adoption.list_expired(store.database, now + timedelta(hours=1)) == [(HALL, "new")]
@@ -101,21 +138,24 @@ def test_an_adopted_reference_of_a_time_to_come_expires(place: Place) -> None:
     """A clock that was set back prolongs nothing."""
     with place.open() as store:
         hall(store)
-        adoption.adopt(store, HALL, adopted("new"))
+        adoption.adopt(store, HALL, adopted("new"), 9)
         place.execute("UPDATE adopted_reference SET adopt_time_us = adopt_time_us + 3600000000")
         assert adoption.list_expired(store.database, datetime.now(timezone.utc) - timedelta(hours=1)) == [(HALL, "new")]
 
 
-@pytest.mark.parametrize("how", ["deleted", "replaced"])
+@pytest.mark.parametrize("how", ["deleted", "replaced", "retired"])
 def test_lost_vouchers_are_weighed_by_their_matches(place: Place, how: str) -> None:
     with place.open() as store:
-        hall(store)
-        key = adoption.adopt(store, HALL, adopted("new")).key
-        assert adoption.missing_vouchers(store, HALL) == {}
-        store.delete_reference(HALL, "a")
+        keys = hall(store)
+        key = adoption.adopt(store, HALL, adopted("new"), 9)[0].key
+        assert adoption.missing_vouchers(store.database, HALL) == {}
+        if how == "retired":
+            adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
+        else:
+            store.delete_reference(HALL, "a")
         if how == "replaced":  # by another photograph with its id
             store.add_references(HALL, [make_reference("a")])
-        assert adoption.missing_vouchers(store, HALL) == {key: 40 / 60}
+        assert adoption.missing_vouchers(store.database, HALL) == {key: 40 / 60}
 
 
 def test_a_retired_reference_leaves_indexes_until_restored(place: Place) -> None:

@@ -13,40 +13,72 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Select, select, update
+from sqlalchemy import Connection, Row, Select, select, update
 
-from mapless.provenance import ADOPTED, Voucher
-from mapless_server.errors import DataLoss, NotFound
+from mapless.provenance import ADOPTED
+from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey
 
-from . import queries, rows
+from . import deletion, queries, rows
 from .database import Database
 from .records import Adopted, NewReference, ReferenceRecord, RetirementReason, Standing
 from .store import Store
-from .tables import adopted_reference, reference, reference_standing
+from .tables import adopted_reference, reference, reference_standing, scene_generation
 
 
 class NotAdopted(Exception):
     """A photograph is not adopted, because the scene or what vouches for it has changed meanwhile; says what."""
 
 
-def adopt(store: Store, scene_key: SceneKey, new: NewReference) -> ReferenceRecord:
+class PlaceFull(Exception):
+    """A photograph is not adopted, because its place has as many adopted references as it may, all as useful."""
+
+
+def adopt(
+    store: Store, scene_key: SceneKey, new: NewReference, most_per_place: int
+) -> tuple[ReferenceRecord, frozenset[str]]:
     """Adds an adopted reference, if the scene still adopts and what vouches for it is still there, in one transaction.
 
-    NotAdopted if not; AlreadyExists if another server was first; otherwise as `Store.add_references`.
+    So many that are not retired are kept at its place, `NewReference.place_key`; the least useful are deleted.
+
+    Returns:
+        The new reference, and the keys of those that were deleted.
+
+    NotAdopted or PlaceFull if it is not added; AlreadyExists if another server was first; otherwise as
+    `Store.add_references`.
     """
     if new.provenance.source != ADOPTED:
         raise ValueError(f"the provenance must be {ADOPTED}, is {new.provenance.source}")
+    column, adopted, left = reference.c, adopted_reference.c, list[str]()
 
     def admit(connection: Connection) -> None:
         if rows.scene_attributes(queries.find_scene(connection, scene_key)).adoption is None:
             raise NotAdopted("the scene adopts no photographs any more")
+        queries.refuse_taken_ids(connection, scene_key, [new.reference_id])  # before the same one leaves for it
         wanted = [it.reference_id for it in new.provenance.vouchers]
-        keys = queries.find_keys(connection, scene_key, wanted)
-        if len(keys) < len(wanted):
-            raise NotAdopted("a surveyed reference that vouches for it was deleted")
+        vouching = select(column.key).where(column.scene_id == scene_key, column.reference_id.in_(wanted))
+        if len(connection.scalars(vouching.where(~queries.is_retired(column.key))).all()) < len(wanted):
+            raise NotAdopted("a surveyed reference that vouches for it was deleted or retired")
+        here = (
+            select(column.key, adopted.usefulness)
+            .join(adopted_reference, adopted.reference_key == column.key)
+            .where(column.scene_id == scene_key, adopted.place_key == new.place_key, ~queries.is_retired(column.key))
+            .order_by(adopted.usefulness, adopted.adopt_time_us, column.key)
+        )
+        found = connection.execute(here).all()
+        leaving = found[: max(0, len(found) + 1 - most_per_place)]
+        if any(it.usefulness >= new.usefulness for it in leaving):
+            raise PlaceFull
+        left[:] = [it.key for it in leaving]
+        if left:
+            generation = queries.begin_change(connection, scene_key, -len(left))
+            deletion.delete_references(connection, *left)
+            queries.note_removals(connection, scene_key, generation, left)
 
-    return store.add_references(scene_key, [new], admit)[0]
+    (record,) = store.add_references(scene_key, [new], admit)
+    if left:
+        store.forget_deleted(left)
+    return record, frozenset(left)
 
 
 def list_adopted(database: Database, scene_key: SceneKey) -> list[Adopted]:
@@ -66,18 +98,19 @@ def list_adopted(database: Database, scene_key: SceneKey) -> list[Adopted]:
         ]
 
 
-def list_adopting_scenes(database: Database) -> list[SceneKey]:
-    """Keys of the scenes that have adopted references, ordered."""
+def list_adopting_scenes(database: Database) -> dict[SceneKey, int]:
+    """Generations of the scenes that have adopted references, by key, ordered."""
     scene_id = reference.c.scene_id
-    statement = (
-        select(scene_id)
+    statement: Select[Any] = (
+        select(scene_id, scene_generation.c.generation)
         .join(adopted_reference, adopted_reference.c.reference_key == reference.c.key)
+        .join(scene_generation, scene_generation.c.scene_id == scene_id)
         .where(~queries.is_detached(scene_id))
         .distinct()
         .order_by(scene_id)
     )
     with database.read() as connection:
-        return [SceneKey(it) for it in connection.scalars(statement)]
+        return {SceneKey(it.scene_id): it.generation for it in connection.execute(statement)}
 
 
 def list_expired(database: Database, before: datetime) -> list[tuple[SceneKey, str]]:
@@ -98,34 +131,42 @@ CLOCKS_DIFFER_US = 60_000_000
 """Clocks of servers that share a store may differ by so much; one that was set back prolongs nothing."""
 
 
-def missing_vouchers(store: Store, scene_key: SceneKey) -> dict[str, float]:
+def missing_vouchers(database: Database, scene_key: SceneKey) -> dict[str, float]:
     """Share of the vouching matches whose references are gone, by key, of adopted references that are not retired.
 
-    Only those that lack some. A reference that was stored after the adopted one is another with the same id.
+    Only those that lack some. A reference that is retired is gone, and one that was stored after the adopted one is
+    another with the same id. Damaged adopted references are left out: they are not used anyway.
     """
-    found = dict[str, float]()
-    for adopted in list_adopted(store.database, scene_key):
-        if adopted.is_retired:
-            continue
-        try:
-            record = store.get_reference(scene_key, adopted.reference_id)
-        except (NotFound, DataLoss):  # deleted meanwhile; a damaged one is not used anyway
-            continue
+    column, found = reference.c, dict[str, float]()
+    is_adopted = column.key.in_(select(adopted_reference.c.reference_key))
+    of_scene = (column.scene_id == scene_key) & ~queries.is_retired(column.key)
+    with database.read() as connection:
+        records = [
+            record
+            for row in connection.execute(select(reference).where(of_scene, is_adopted))
+            if (record := _undamaged(row)) is not None
+        ]
+        named = sorted({it.reference_id for record in records for it in record.provenance.vouchers})
+        surveyed: Select[Any] = select(column.reference_id, column.create_time_us).where(of_scene, ~is_adopted)
+        created = {
+            it.reference_id: rows.time_of(it.create_time_us)
+            for ids in queries.portions(named)
+            for it in connection.execute(surveyed.where(column.reference_id.in_(ids)))
+        }
+    for record in records:
         vouchers = record.provenance.vouchers
-        lost = sum(it.match_count for it in vouchers if not _vouches(store, record, it))
+        there = {it for it in vouchers if (at := created.get(it.reference_id)) and at <= record.create_time}
+        lost = sum(it.match_count for it in vouchers if it not in there)
         if lost:
-            found[adopted.key] = lost / sum(it.match_count for it in vouchers)
+            found[record.key] = lost / sum(it.match_count for it in vouchers)
     return found
 
 
-def _vouches(store: Store, record: ReferenceRecord, voucher: Voucher) -> bool:
+def _undamaged(row: Row[Any]) -> ReferenceRecord | None:
     try:
-        there = store.get_reference(record.scene_key, voucher.reference_id)
-    except NotFound:
-        return False
+        return rows.reference_record(row)
     except DataLoss:
-        return False
-    return there.create_time <= record.create_time and there.provenance.source != ADOPTED
+        return None
 
 
 def set_usefulness(database: Database, usefulness: Mapping[str, float]) -> None:

@@ -104,7 +104,7 @@ def is_within(limit: SceneLimit, tenant: str) -> ColumnElement[bool]:
 def read_scenes(connection: Connection, found: Sequence[Row[Any]]) -> list[SceneRecord]:
     """Makes the records of rows of `select_scenes`; raises DataLoss if the attributes of one are damaged."""
     column, labels = scene_label.c, defaultdict[str, dict[str, str]](dict)
-    for some in _portions([row.scene_id for row in found]):
+    for some in portions([row.scene_id for row in found]):
         for label in connection.execute(select(scene_label).where(column.scene_id.in_(some)).order_by(column.name)):
             labels[label.scene_id][label.name] = label.value
     return [rows.scene_record(row, labels[row.scene_id]) for row in found]
@@ -202,7 +202,7 @@ def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequen
     statement = select(column.reference_id, column.key).where(column.scene_id == scene_key)
     parts = [statement.order_by(column.reference_id)]
     if reference_ids is not None:
-        parts = [statement.where(column.reference_id.in_(ids)) for ids in _portions(reference_ids)]
+        parts = [statement.where(column.reference_id.in_(ids)) for ids in portions(reference_ids)]
     return {row.reference_id: row.key for part in parts for row in connection.execute(part)}
 
 
@@ -256,7 +256,7 @@ def features_by_key(connection: Connection, keys: Sequence[str], extractor: str)
 def descriptors_by_key(connection: Connection, keys: Sequence[str], name: str) -> dict[str, Row[Any]]:
     """Rows of `global_descriptor` with this name, by the keys of their references."""
     column, found = global_descriptor.c, dict[str, Row[Any]]()
-    for portion in _portions(keys):
+    for portion in portions(keys):
         is_wanted = column.reference_key.in_(portion) & (column.name == name)
         stored: Select[Any] = select(column.reference_key, column.data, column.sha256).where(is_wanted)
         found |= {row.reference_key: row for row in connection.execute(stored)}
@@ -345,7 +345,7 @@ def _one(connection: Connection, statement: Select[Any], missing: Callable[[], N
 def _by_key(connection: Connection, statement: Select[Any], keys: Sequence[str]) -> dict[str, Row[Any]]:
     return {
         row.key: row
-        for portion in _portions(keys)
+        for portion in portions(keys)
         for row in connection.execute(statement.where(reference.c.key.in_(portion)))
     }
 
@@ -364,7 +364,8 @@ def _upsert(connection: Connection, table: Table) -> Any:
     return postgresql.insert(table)
 
 
-def _portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:
+def portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:
+    """The ids, in portions of so many as one statement may name."""
     for start in range(0, len(ids), _IDS_PER_STATEMENT):
         yield ids[start : start + _IDS_PER_STATEMENT]
 

@@ -201,7 +201,7 @@ class RetirementReason(str, Enum):
     SURVEY_OUTDATED = "survey_outdated"
     """Of an adopted one: photographs of its place show too little of what was surveyed."""
     VOUCHERS_GONE = "vouchers_gone"
-    """Of an adopted one: the surveyed references that its pose rests on were deleted."""
+    """Of an adopted one: the surveyed references that its pose rests on were deleted or retired."""
 
 
 @dataclass(frozen=True)

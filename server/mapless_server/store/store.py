@@ -346,9 +346,13 @@ class Store(StoreReader):
                 return self._delete_reference(scene_key, reference_id, deletion.move_aside)
 
         key = with_room_to_delete(self.database, delete)
-        self._last_deletion = object()
-        self.reference_cache.forget(lambda _, it: it.record.key == key)
+        self.forget_deleted([key])
         return key
+
+    def forget_deleted(self, keys: Collection[str]) -> None:
+        """Frees the memory of references that have been deleted."""
+        self._last_deletion = object()
+        self.reference_cache.forget(lambda _, it: it.record.key in keys)
 
     def _delete_reference(
         self, scene_key: SceneKey, reference_id: str, delete: Callable[[Connection, str], None]
@@ -368,8 +372,7 @@ class Store(StoreReader):
         retired = queries.select_references().where(column.scene_id == scene_key, is_wanted)
         with self.database.read() as connection:
             found = connection.execute(retired.order_by(column.reference_id)).all()
-        known = {it.reference_id: rows.retirement(it) for it in found}
-        return {name: it for name, it in known.items() if it is not None}
+        return {it.reference_id: why for it in found if (why := rows.retirement(it)) is not None}
 
     @observed
     def restore_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:

@@ -8,7 +8,7 @@ else a thing that was moved, as a poster, would take a photograph of another pla
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -30,6 +30,9 @@ MOST_WITNESSES = 100
 @dataclass(frozen=True)
 class AdoptionOptions:
     """Bounds of adoption that are the same for all scenes.
+
+    All are conventions: none was chosen among alternatives by a measurement. `research.renovation` and
+    `research.adoption_attack` measure what all of them together lead to.
 
     Attributes:
         min_matches: least matches with surveyed references that agree with the pose from them.
@@ -248,8 +251,3 @@ def is_contradicted(standing: Standing, options: AdoptionOptions) -> bool:
 def with_usefulness(usefulness: float, share: float, options: AdoptionOptions) -> float:
     """Usefulness of an adopted reference after a photograph of its place that has this share of matches with it."""
     return usefulness + (share - usefulness) / options.remembered
-
-
-def least_useful(usefulness: Sequence[float], most: int) -> int | None:
-    """Index of the reference that makes room for another at a place; None if the place has room."""
-    return None if len(usefulness) < most else int(np.argmin(usefulness))

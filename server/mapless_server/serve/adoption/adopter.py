@@ -9,7 +9,6 @@ import asyncio
 import hashlib
 import logging
 import time
-from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -33,17 +32,16 @@ from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scheduling import Flow
-from mapless_server.security import Principal, SceneKey
+from mapless_server.security import Principal, SceneKey, tenant_of
 from mapless_server.services.messages.answers import AnswerFrames, outcome_to_message
 from mapless_server.store import NewReference, RetirementReason, Store, adoption, time_us
 from mapless_server.store.records import Adopted, Standing
 
 from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px, shares_compared
+from .waiting import Candidate, Waiting
 
 log = logging.getLogger(__name__)
 
-MAX_WAITING, MAX_WAITING_BYTES = 32, 64 * 2**20
-"""Photographs that wait to be considered, and their bytes together."""
 MOST_CHOSEN_AMONG = 1000
 """Surveyed references that a photograph is localized from again: the nearest, as many as a request may name."""
 MOST_COMPARED, MOST_SUPPORTING = 6, 4
@@ -55,24 +53,8 @@ LOOK_S = 0.02
 MAINTAINED_S = 60.0
 MOST_LOST_SHARE = 0.5
 """Share of the vouching matches of an adopted reference whose references may be gone."""
-OWN_FLOW = Flow("", "adoption")
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """An answered photograph that may become a reference.
-
-    Attributes:
-        query: as it was asked.
-        answered: its answer.
-        inliers_px: (M, 2) the keypoints of the matches that agree with it, pixels of the photograph as it was sent.
-        holder: its caller, see `policy.holder_of`.
-    """
-
-    query: Query
-    answered: Evidence
-    inliers_px: Array
-    holder: str = ""
+OWN_CALLER = "adoption"
+"""Jobs are the scene's tenant's, from whose share of computing time they are, by a caller of their own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +101,9 @@ class Adopter:
         self._options = options
         self._quiet_s = quiet_s
         self._now = now
-        self._waiting: deque[Candidate] = deque()
-        self._waiting_bytes = 0
-        self._arrived = asyncio.Event()
-
-    @property
-    def waiting_count(self) -> int:
-        """Photographs that wait to be considered."""
-        return len(self._waiting)
+        self._waiting = Waiting()
+        self._checked: dict[SceneKey, int] = {}
+        """Generations of the scenes at which all that vouches for their adopted references was looked up."""
 
     def offer(
         self,
@@ -146,37 +123,29 @@ class Adopter:
         if evidence is None or evidence.trust < policy.min_trust or evidence.position_68_m > policy.max_radius_m:
             self._observer.count("adoptions", 1, "uncertain")
             return
-        size_bytes = query.photo.size_bytes
-        if len(self._waiting) >= MAX_WAITING or self._waiting_bytes + size_bytes > MAX_WAITING_BYTES:
-            self._observer.count("adoptions", 1, "queue")
-            return
-        self._waiting.append(
-            Candidate(
-                replace(query, photo=replace(query.photo, depth=None)),
-                evidence,
-                inliers_px(result),
-                rules.holder_of(principal),
-            )
-        )
-        self._waiting_bytes += size_bytes
-        self._arrived.set()
+        kept = replace(query, photo=replace(query.photo, depth=None))
+        holder, now_s = rules.holder_of(principal), time.monotonic()
+        left = self._waiting.add(Candidate(kept, evidence, inliers_px(result), holder, now_s))
+        self._observer.count("adoptions", left, "queue")
 
     async def run(self) -> None:
-        """Considers what is offered until it is cancelled; each failure is logged and counted, and ends nothing."""
-        maintained_s = -MAINTAINED_S
+        """Considers what is offered until it is cancelled; each failure is logged and counted, and ends nothing.
+
+        What is too old is deleted meanwhile, also while the server is never idle.
+        """
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._maintain_always())
+            while True:
+                await self._waiting.arrived(MAINTAINED_S)
+                await self._until_idle()
+                if (candidate := self._waiting.pop()) is not None:
+                    await self._guarded(self.consider(candidate), "a photograph could not be considered as a reference")
+
+    async def _maintain_always(self) -> None:
         while True:
-            if time.monotonic() - maintained_s >= MAINTAINED_S:
-                await self._guarded(self.maintain(), "adopted references could not be looked after")
-                maintained_s = time.monotonic()
-            if not self._waiting:
-                self._arrived.clear()
-                with suppress(TimeoutError):
-                    await asyncio.wait_for(self._arrived.wait(), MAINTAINED_S)
-                continue
-            await self._until_idle()
-            candidate = self._waiting.popleft()
-            self._waiting_bytes -= candidate.query.photo.size_bytes
-            await self._guarded(self.consider(candidate), "a photograph could not be considered as a reference")
+            self._observer.count("adoptions", self._waiting.drop_old(), "queue")
+            await self._guarded(self.maintain(), "adopted references could not be looked after")
+            await asyncio.sleep(MAINTAINED_S)
 
     async def _guarded(self, work: Awaitable[object], fault: str) -> None:
         try:
@@ -202,10 +171,13 @@ class Adopter:
         for scene_key, reference_id in await asyncio.to_thread(adoption.list_expired, self._store.database, before):
             await asyncio.to_thread(self._delete, scene_key, reference_id)
             self._observer.count("adopted_expired")
-        for scene_key in await asyncio.to_thread(adoption.list_adopting_scenes, self._store.database):
-            lost = await asyncio.to_thread(adoption.missing_vouchers, self._store, scene_key)
-            gone = [key for key, share in lost.items() if share > MOST_LOST_SHARE]
-            await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
+        scenes = await asyncio.to_thread(adoption.list_adopting_scenes, self._store.database)
+        for scene_key, generation in scenes.items():
+            if self._checked.get(scene_key) != generation:
+                lost = await asyncio.to_thread(adoption.missing_vouchers, self._store.database, scene_key)
+                gone = [key for key, share in lost.items() if share > MOST_LOST_SHARE]
+                await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
+        self._checked = scenes
 
     async def consider(self, candidate: Candidate) -> Refusal | None:
         """Adopts a photograph, or says why not; also counts what it says of the references around.
@@ -241,16 +213,17 @@ class Adopter:
         """The references around a pose; None without surveyed ones."""
         context = StageContext(lambda: None)
         entries = self._engine.references.retrievals[0].indexes.entries(scene_key, context, waits=False)
-        adopted = {it.key for it in adoption.list_adopted(self._store.database, scene_key)}
-        rows = entries.rows()
-        by_distance = np.argsort(np.linalg.norm(entries.centres(rows) - pose.translation, axis=1), kind="stable")
-        near = rows[by_distance[: MOST_CHOSEN_AMONG + len(adopted)]].tolist()
-        named = {row: entries.reference(row)[:2] for row in near}
-        chosen = np.array([row for row in near if named[row][1] not in adopted][:MOST_CHOSEN_AMONG], np.intp)
+        adopted = [it.key for it in adoption.list_adopted(self._store.database, scene_key)]
+        rows = np.setdiff1d(entries.rows(), list(entries.rows_of_keys(adopted).values()), assume_unique=True)
+        distance = np.linalg.norm(entries.centres(rows) - pose.translation, axis=1)
+        if len(rows) > MOST_CHOSEN_AMONG:
+            some = np.argpartition(distance, MOST_CHOSEN_AMONG)[:MOST_CHOSEN_AMONG]
+            rows, distance = rows[some], distance[some]
+        chosen = rows[np.argsort(distance, kind="stable")]
         if not len(chosen):
             return None
         centres, axes = entries.centres(chosen), entries.axes(chosen)
-        ids, keys = zip(*(named[row] for row in chosen.tolist()), strict=True)
+        ids, keys = zip(*(entries.reference(row)[:2] for row in chosen.tolist()), strict=True)
         nearest = rules.nearest_viewpoint(centres, axes, pose)
         return Place(ids, keys, centres, axes, keys[nearest], ids[nearest])
 
@@ -272,7 +245,11 @@ class Adopter:
             allow_coarse=False,
         )
         engine = self._engine
-        return await engine.run(engine.query_job(again, Caller(OWN_FLOW, time.monotonic() + LIMIT_S)))
+        return await engine.run(engine.query_job(again, self._caller(query.scene_key)))
+
+    @staticmethod
+    def _caller(scene_key: SceneKey) -> Caller:
+        return Caller(Flow(tenant_of(scene_key), OWN_CALLER), time.monotonic() + LIMIT_S)
 
     @staticmethod
     def _evidence(query: Query, result: Result) -> Evidence | None:
@@ -312,7 +289,9 @@ class Adopter:
 
         def learned(_: str, known: Standing) -> Standing:
             # Once outdated it stays so until a new survey: answers by what is left of the old one say nothing.
-            return known if rules.is_outdated(known, policy, options) else rules.with_share(known, share, options)
+            # A masked photograph shows what its mask has left.
+            is_left = bool(candidate.query.photo.mask) or rules.is_outdated(known, policy, options)
+            return known if is_left else rules.with_share(known, share, options)
 
         made = await asyncio.to_thread(adoption.change_standings, database, [place.key], learned)
         here = [it for it in await self._adopted(candidate) if it.place_key == place.key and not it.is_retired]
@@ -378,11 +357,7 @@ class Adopter:
     ) -> Refusal | None:
         """Stores a photograph as a reference, in place of the least useful one where its place is full."""
         scene_key, photo = candidate.query.scene_key, candidate.query.photo
-        here = [it for it in await self._adopted(candidate) if it.place_key == place.key]
-        leaves = rules.least_useful([it.usefulness for it in here], policy.most_per_place)
-        if leaves is not None and here[leaves].usefulness >= options.first_usefulness:
-            return rules.Refusal.PLACE_FULL
-        (found,) = await self._engine.describe([photo], Caller(OWN_FLOW, time.monotonic() + LIMIT_S))
+        (found,) = await self._engine.describe([photo], self._caller(scene_key))
         vouchers = sorted(surveyed.inliers_of.items(), key=lambda it: -it[1])[:MOST_VOUCHERS]
         radii = (surveyed.position_68_m, surveyed.position_95_m, surveyed.rotation_68_deg, surveyed.rotation_95_deg)
         share = rules.surveyed_share(candidate.answered, surveyed)
@@ -400,12 +375,13 @@ class Adopter:
             usefulness=options.first_usefulness,
         )
         try:
-            record = await asyncio.to_thread(adoption.adopt, self._store, scene_key, new)
+            record, left = await asyncio.to_thread(adoption.adopt, self._store, scene_key, new, policy.most_per_place)
+        except adoption.PlaceFull:
+            return rules.Refusal.PLACE_FULL
         except (adoption.NotAdopted, AlreadyExists) as error:  # by the operator, or another server
             log.info("a photograph is not adopted: %s", error)
             return rules.Refusal.CHANGED
-        if leaves is not None:
-            await asyncio.to_thread(self._delete, scene_key, here[leaves].reference_id)
+        self._engine.forget_references(left)
         self._engine.references.agreements.changed(scene_key)
         log.info("scene %s adopts %s at the place of %s", scene_key, record.reference_id, place.reference_id)
         return None

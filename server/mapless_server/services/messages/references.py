@@ -111,7 +111,7 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
 _RETIRED_BECAUSE = {
     RetirementReason.CONTRADICTED: "photographs from about its viewpoint do not show what it shows",
     RetirementReason.SURVEY_OUTDATED: "photographs of its place show too little of what was surveyed: survey it again",
-    RetirementReason.VOUCHERS_GONE: "the surveyed references that its pose rests on were deleted",
+    RetirementReason.VOUCHERS_GONE: "the surveyed references that its pose rests on were deleted or retired",
 }
 
 

@@ -1,0 +1,74 @@
+"""Photographs that wait to be considered as references, of several tenants."""
+
+import asyncio
+import time
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from mapless_server.engine.query import Query
+from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.scenes.adoption.policy import Evidence
+from mapless_server.scenes.observer import BackgroundObserver
+from mapless_server.security import key_of
+from mapless_server.serve.adoption import adopter
+from mapless_server.serve.adoption import waiting as module
+from mapless_server.serve.adoption.waiting import MAX_WAITING, MAX_WAITING_BYTES, MOST_WAITING_S, Candidate, Waiting
+from mapless_server.store import Store
+
+
+def candidate(tenant: str = "one", size_bytes: int = 1, offered_s: float = 0.0) -> Candidate:
+    query = SimpleNamespace(scene_key=key_of(tenant, "room"), photo=SimpleNamespace(size_bytes=size_bytes))
+    return Candidate(cast(Query, query), cast(Evidence, None), np.empty((0, 2)), "", offered_s)
+
+
+def tenants(waiting: Waiting) -> list[str]:
+    found = []
+    while (it := waiting.pop()) is not None:
+        found.append(it.tenant)
+    return found
+
+
+def test_one_tenant_cannot_fill_the_queue() -> None:
+    waiting = Waiting()
+    assert sum(waiting.add(candidate()) for _ in range(1000)) == 1000 - MAX_WAITING
+    assert [waiting.add(candidate("two")) for _ in range(100)].count(1) == 100
+    assert tenants(waiting) == ["one"] * (MAX_WAITING // 2) + ["two"] * (MAX_WAITING // 2)
+
+
+def test_large_photographs_make_room_for_another_tenant() -> None:
+    waiting = Waiting()
+    assert [waiting.add(candidate(size_bytes=MAX_WAITING_BYTES // 4)) for _ in range(5)] == [0, 0, 0, 0, 1]
+    assert waiting.add(candidate("two", MAX_WAITING_BYTES // 2)) == 2
+    assert waiting.add(candidate("two", MAX_WAITING_BYTES + 1)) == 1
+    assert tenants(waiting) == ["one", "one", "two"]
+
+
+def test_what_has_waited_too_long_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    waiting = Waiting()
+    for offered_s in (0.0, 10.0):
+        waiting.add(candidate(offered_s=offered_s))
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: MOST_WAITING_S + 5.0))
+    assert (waiting.drop_old(), len(waiting)) == (1, 1)
+
+
+async def test_a_busy_server_deletes_what_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    busy = SimpleNamespace(queue=SimpleNamespace(job_count=1, busy_s=0.0))
+    nobody = SimpleNamespace(count=lambda *_: None)
+    its = adopter.Adopter(cast(QueueEngine, busy), cast(Store, None), cast(BackgroundObserver, nobody), 24.0)
+    maintained: asyncio.Queue[None] = asyncio.Queue()
+    monkeypatch.setattr(its, "maintain", lambda: maintained.put(None))
+    monkeypatch.setattr(adopter, "MAINTAINED_S", 0.01)
+    its._waiting.add(candidate(offered_s=time.monotonic()))
+    running = asyncio.create_task(its.run())
+    for _ in range(3):
+        await asyncio.wait_for(maintained.get(), 10.0)
+    assert len(its._waiting) == 1
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+
+
+def test_computing_time_is_of_the_tenant_of_the_scene() -> None:
+    assert adopter.Adopter._caller(key_of("two", "room")).flow.tenant == "two"
