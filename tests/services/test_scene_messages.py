@@ -1,28 +1,44 @@
 """Several scenes in a request: which are searched, and what its priors say in each of their worlds."""
 
 import math
+import threading
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from google.protobuf.json_format import ParseDict
+from support.corner import CAMERA
+from support.images import encode
 
 from mapless.geodesy import Datum, geodetic_from_world, geopose, pose_from_geopose
 from mapless.geometry import Array, Quaternion, RigidTransform, rotation_from_vector
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import FieldError, transform_to_message
-from mapless_server.engine.query import SceneQuestion
+from mapless_server.engine.options import EngineOptions
+from mapless_server.engine.query import Photo, Query, SceneQuestion
+from mapless_server.method.options import LocalizeOptions
+from mapless_server.rpc import Call
+from mapless_server.scenes import ANYWHERE
 from mapless_server.security import DEFAULT_TENANT, SceneKey
+from mapless_server.services.localization import LocalizationService
 from mapless_server.services.messages import scenes as module
+from mapless_server.services.messages.groups import queries_among
 from mapless_server.services.messages.priors import priors_from_message
 from mapless_server.services.messages.scenes import (
     FoundScenes,
+    allowed_from_message,
     names_several,
     questions_from_message,
     scene_keys_from_message,
 )
-from mapless_server.store import GroupedScene, SceneAttributes
+from mapless_server.services.photographs import in_scene
+from mapless_server.services.watching import Watchers
+from mapless_server.store import GroupedScene, SceneAttributes, Store
 
 TURN = Quaternion(0.0, 0.0, math.sin(0.35), math.cos(0.35))
 TILTED = Quaternion(0.5, -0.5, -0.5, 0.5)
@@ -37,6 +53,11 @@ NEAR = {"position_m": {"x": 3, "y": -2, "z": 1.5}, "radius_m": 7, "covariance_m2
 LOOKING = {"direction": {"x": 0.6, "y": 0.8}, "max_angle_deg": 30, "sigma_deg": 10}
 DOWN = {"down_in_camera": {"y": 1}, "sigma_deg": 1}
 GEO = {"latitude_deg": 47.3771, "longitude_deg": 8.542, "horizontal_sigma_m": 4}
+WIDE = {"position_m": {}, "covariance_m2": np.diag([1e-8, 1e12, 1e4]).ravel().tolist()}
+"""Less certain along x in the worlds of other scenes than in the one that it is given in."""
+
+IMAGE = encode(".png", np.zeros((CAMERA.height_px, CAMERA.width_px, 3), np.uint8))
+PART = Query(SceneKey("s0"), (), Photo(IMAGE, CAMERA, "image"), ANYWHERE, 2, LocalizeOptions(), is_part=True)
 
 
 def found(*attributes: SceneAttributes) -> FoundScenes:
@@ -59,6 +80,19 @@ def questions(scenes: FoundScenes, **fields: Any) -> Sequence[SceneQuestion]:
 def unknown(scenes: Sequence[GroupedScene]) -> Array:
     """Extents of scenes that were not searched yet."""
     return np.full(len(scenes), np.inf)
+
+
+def counted_conversions(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Indices of scenes for which priors are converted from now on."""
+    converted: list[int] = []
+    question = module._ScenePriors.question
+
+    def counted(it: Any, index: int) -> SceneQuestion:
+        converted.append(index)
+        return question(it, index)
+
+    monkeypatch.setattr(module._ScenePriors, "question", counted)
+    return converted
 
 
 WAYS = {"scene": "scenes/a", "scenes": ["scenes/a"], "scene_group": {}}
@@ -160,8 +194,7 @@ def test_limits_in_one_world_hold_at_the_same_places_of_another() -> None:
 
 
 def test_the_widest_and_the_surest_prior_can_be_turned() -> None:
-    wide = {"position_m": {}, "covariance_m2": np.diag([1e-8, 1e12, 1e4]).ravel().tolist()}
-    _, there = questions(found(HALL, YARD), prior_scene="scenes/s0", position_prior=wide)
+    _, there = questions(found(HALL, YARD), prior_scene="scenes/s0", position_prior=WIDE)
     assert there.priors.position is not None
     sigmas_m = np.sqrt(np.linalg.eigvalsh(there.priors.position.covariance))
     np.testing.assert_allclose(sigmas_m, [10.0, 100.0, 1e6], rtol=0.01)
@@ -193,14 +226,7 @@ def test_what_holds_on_the_earth_is_in_each_scene_as_if_it_were_named() -> None:
 def test_scenes_beyond_a_geo_position_cost_no_conversion(monkeypatch: pytest.MonkeyPatch) -> None:
     far = [SceneAttributes(Datum(-60.0 + i / 20, i / 12, 0.0)) for i in range(1_997)]
     scenes = found(HALL, *far, YARD, LOST)
-    converted: list[int] = []
-    question = module._ScenePriors.question
-
-    def counted(it: Any, index: int) -> SceneQuestion:
-        converted.append(index)
-        return question(it, index)
-
-    monkeypatch.setattr(module._ScenePriors, "question", counted)
+    converted = counted_conversions(monkeypatch)
     sent = request(geo_position_prior=GEO)
     asked = questions_from_message(sent, scenes, DEFAULT_TENANT, lambda them: np.full(len(them), 100.0))
     assert [it.scene_key for it in asked.questions] == ["s0", "s1998", "s1999"]
@@ -217,7 +243,12 @@ SURE = GEO | {"horizontal_sigma_m": 1e-4, "height_m": 450.0, "vertical_sigma_m":
 
 @pytest.mark.parametrize(
     "fields",
-    [{"geo_position_prior": GEO}, {"geo_position_prior": SURE}, {"position_prior": NEAR, "prior_scene": "scenes/s0"}],
+    [
+        {"geo_position_prior": GEO},
+        {"geo_position_prior": SURE},
+        {"position_prior": WIDE, "prior_scene": "scenes/s0"},
+        {"position_prior": NEAR, "prior_scene": "scenes/s0"},
+    ],
 )
 def test_a_scene_with_a_reference_that_is_likely_is_kept(fields: dict[str, Any]) -> None:
     assert HALL.datum is not None
@@ -234,6 +265,64 @@ def test_a_scene_with_a_reference_that_is_likely_is_kept(fields: dict[str, Any])
         if np.all([it.keeps(centres, narrowing.margin_m) for it in limits], axis=0).any():
             assert question.scene_key in kept
     assert len(kept) < 61
+
+
+def test_limits_count_in_a_scene_that_they_left_out() -> None:
+    """A photograph of a rig whose scene is found by another one is answered as if that scene were named."""
+    sent = request(position_prior=NEAR, prior_scene="scenes/s0")
+    allowed = allowed_from_message(sent, found(HALL, YARD), DEFAULT_TENANT, lambda _: np.ones(2))
+    assert [it.scene_key for it in allowed] == ["s0"]
+    there = in_scene(replace(PART, scenes=allowed), SceneKey("s1"))
+    _, named = questions(found(HALL, YARD), position_prior=NEAR, prior_scene="scenes/s0")
+    assert there.narrowing.position is not None
+    assert named.narrowing.position is not None
+    np.testing.assert_array_equal(there.narrowing.position.position, named.narrowing.position.position)
+    assert (there.scene_key, there.attributes, bool(there.priors)) == ("s1", YARD, True)
+
+
+def test_photographs_that_are_not_looked_for_cost_no_conversion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among 100 scenes, the next ones are looked for only where the first is not found: one question names a scene."""
+    converted = counted_conversions(monkeypatch)
+    rig = pb.LocalizeRigRequest()
+    for _ in range(3):
+        rig.images.add(image=IMAGE, geo_position_prior=ParseDict(GEO, pb.GeoPositionPrior()))
+    scenes = found(*[HALL, YARD] * 50)
+    ask = partial(allowed_from_message, found=scenes, tenant=DEFAULT_TENANT, extents=unknown)
+    queries = queries_among(rig, "images", (1, 8), EngineOptions(), ask)
+    assert ([len(it.scenes) for it in queries], len(converted)) == ([100] * 3, 3)
+    queries[1].in_prior_scene()  # as the event loop does when it begins
+    assert len(converted) == 3
+
+
+async def test_the_event_loop_does_not_convert_priors_of_rigs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: list[threading.Thread] = []
+    question = module._ScenePriors.question
+
+    def noted(it: Any, index: int) -> SceneQuestion:
+        threads.append(threading.current_thread())
+        return question(it, index)
+
+    monkeypatch.setattr(module._ScenePriors, "question", noted)
+    rig = pb.LocalizeRigRequest()
+    rig.scene_group.SetInParent()
+    rig.images.add(image=IMAGE, geo_position_prior=ParseDict(GEO, pb.GeoPositionPrior()))
+    engine: Any = SimpleNamespace(options=EngineOptions(), references=SimpleNamespace(extents_m=unknown))
+    metrics: Any = None
+    with Store.open(tmp_path) as store:
+        store.create_scene(SceneKey("s0"), HALL)
+        service = LocalizationService(lambda: engine, metrics, store, Watchers(False))
+        await service._queries(rig, "images", (1, 8), Call("id", 0.0, math.inf))
+    assert threads
+    assert threading.current_thread() not in threads
+
+
+@pytest.mark.parametrize("sigma_deg", [0, 91])
+def test_a_wrong_gravity_is_refused_before_it_is_converted(sigma_deg: float) -> None:
+    with pytest.raises(FieldError) as error:
+        allowed_from_message(
+            request(gravity_prior=DOWN | {"sigma_deg": sigma_deg}), found(DOLL, HALL), DEFAULT_TENANT, unknown
+        )
+    assert error.value.field == "gravity_prior.sigma_deg"
 
 
 def test_a_geo_position_far_from_all_scenes_leaves_all() -> None:

@@ -223,7 +223,8 @@ class Query:
 
     def in_prior_scene(self) -> tuple[Query, bool]:
         """The query in the scene of its prior, or in any one of its scenes; and whether it can be tracked there."""
-        named = next((it for it in self.scenes if it.scene_key == self.prior_scene), None)
+        asked = self.scenes if self.prior_scene is not None else ()
+        named = next((it for it in asked if it.scene_key == self.prior_scene), None)
         query = self.in_scene(named or self.scenes[0])
         return query, named is not None and query.can_be_tracked
 

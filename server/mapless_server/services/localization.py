@@ -47,7 +47,7 @@ from .messages.groups import (
 )
 from .messages.priors import needs_attributes
 from .messages.queries import among, query_among, query_from_message
-from .messages.scenes import AskedScenes, names_several, questions_from_message
+from .messages.scenes import AskedScenes, allowed_from_message, names_several, questions_from_message
 from .photographs import Joint, localize_group
 from .reach import Reach
 from .watching import Watcher, Watchers
@@ -249,14 +249,22 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     ) -> tuple[Query, ...]:
         """Converts the photographs of a request to queries; FieldError or RequestError names the wrong field."""
         if names_several(request):
-            find = partial(self._scenes.find, request, call.principal)
-            found, extents = await asyncio.to_thread(find), self._engine().references.extents_m
-            questions = partial(questions_from_message, found=found, tenant=call.principal.tenant, extents=extents)
-            call.note(scenes=len(found.scenes))
-            return queries_among(request, list_name, bounds, self._engine().options, questions)
+            return await asyncio.to_thread(self._queries_among, request, list_name, bounds, call)
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
         tenant, attributes = tenant_of(scene_key), await self._attributes(getattr(request, list_name), scene_key)
         return queries_from_message(request, list_name, bounds, tenant, self._engine().options, attributes)
+
+    def _queries_among(
+        self,
+        request: pb.LocalizeRigRequest | pb.LocalizeSequenceRequest,
+        list_name: str,
+        bounds: tuple[int, int],
+        call: Call,
+    ) -> tuple[Query, ...]:
+        engine, tenant, found = self._engine(), call.principal.tenant, self._scenes.find(request, call.principal)
+        questions = partial(allowed_from_message, found=found, tenant=tenant, extents=engine.references.extents_m)
+        call.note(scenes=len(found.scenes))
+        return queries_among(request, list_name, bounds, engine.options, questions)
 
     async def _attributes(self, photos: Sequence[Any], scene_key: SceneKey) -> SceneAttributes:
         """Attributes of the scene, if the priors of one of the photographs' messages need them."""

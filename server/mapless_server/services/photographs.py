@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 from mapless_server.engine.groups import GroupResult, PhotoGroup, after_rejection
-from mapless_server.engine.query import Query, Result, SceneQuestion
+from mapless_server.engine.query import Query, Result
 from mapless_server.errors import RequestError
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.rejection import Rejection
 from mapless_server.rpc import Call
-from mapless_server.scenes import ANYWHERE
 from mapless_server.security import SceneKey
+
+from .messages.scenes import SceneQuestions
 
 if TYPE_CHECKING:  # services do not load what computes
     from mapless_server.engine.queue_engine import QueueEngine
@@ -163,6 +164,10 @@ def common_scene(results: Sequence[Result]) -> SceneKey | Rejection | None:
 
 
 def in_scene(query: Query, scene_key: SceneKey) -> Query:
-    """The query of a photograph in one of its scenes; without priors where these have left that scene out."""
-    question = next((it for it in query.scenes if it.scene_key == scene_key), SceneQuestion(scene_key, ANYWHERE))
+    """The query of a photograph in one of its scenes; its priors count there also where they left that scene out."""
+    scenes = query.scenes
+    if isinstance(scenes, SceneQuestions):
+        question = scenes.of_scene(scene_key)
+    else:
+        question = next(it for it in scenes if it.scene_key == scene_key)
     return replace(query.in_scene(question), scenes=(), prior_scene=None)

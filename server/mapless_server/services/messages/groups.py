@@ -50,7 +50,6 @@ from .queries import (
     with_depth,
 )
 from .radii import ReportedRadii
-from .scenes import AskedScenes
 from .uncertainty import uncertain_options
 
 if TYPE_CHECKING:
@@ -101,7 +100,7 @@ def queries_among(
     list_name: str,
     bounds: tuple[int, int],
     engine: EngineOptions,
-    questions: Callable[[pb.LocalizeRequest], AskedScenes],
+    questions: Callable[[pb.LocalizeRequest], Sequence[SceneQuestion]],
 ) -> tuple[Query, ...]:
     """Converts the photographs of a request with several scenes to queries among them.
 
@@ -113,8 +112,7 @@ def queries_among(
         for name in PRIORS:
             if message.HasField(name):
                 getattr(alone, name).CopyFrom(getattr(message, name))
-        asked = questions(alone)
-        return [*asked.questions, *(() if asked.beyond is None else asked.beyond())]
+        return questions(alone)
 
     found = _asked(request, list_name, bounds, among)
     first = [(SceneQuestion(it[0].scene_key, ANYWHERE), ()) for it in found]
