@@ -119,6 +119,14 @@ def test_a_retired_reference_is_named_and_restored(client: Client, server: Runni
         client.restore_reference(scene, "gone")
 
 
+def test_reranking_says_that_a_named_reference_is_retired(client: Client, server: RunningServer, scene: str) -> None:
+    adoption.retire(store_of(server), SceneKey(scene), [key_of(server, scene, "r1")], RetirementReason.CONTRADICTED)
+    with pytest.raises(NotFound, match="is retired") as caught:
+        client.localize(PHOTO, CAMERA, scene, ["r0", "r1"], rerank_references=True)
+    assert (caught.value.reason, caught.value.field) == ("REFERENCE_RETIRED", "references[1]")
+    client.localize(PHOTO, CAMERA, scene, ["r0", "r1"])  # as it is
+
+
 def test_all_references_of_a_page_may_be_retired(client: Client, server: RunningServer, scene: str) -> None:
     keys = [key_of(server, scene, it) for it in ("r0", "r1", "r2")]
     adoption.retire(store_of(server), SceneKey(scene), keys, RetirementReason.CONTRADICTED)

@@ -25,7 +25,6 @@ from mapless_server.scenes.retrieval.ranking import nearest_references, rank_amo
 from mapless_server.scenes.scene_agreements import SceneAgreements
 from mapless_server.security import SceneKey
 from mapless_server.store import GroupedScene
-from mapless_server.store.queries import reference_not_found
 
 from .query import POSE_PRIOR
 
@@ -88,7 +87,7 @@ class References:
 
         The descriptor is that of the extractor's features if they have one of their own; references that still lack it
         come last, and FeaturesMissing is raised where all do. NotFound if there is no such scene (field "scene") or
-        reference (field "references[i]"); DataLoss if a named reference is damaged (same field); InvalidArgument if
+        reference, or it is retired (field "references[i]"); DataLoss if it is damaged (same field); InvalidArgument if
         the image is bad.
         """
         return again_if_damaged(lambda: self._choose(scene_key, views, selection, context, extractor))
@@ -109,10 +108,7 @@ class References:
             return Choice(tuple(nearest), POSE_PRIOR, entries.generation)
         for index, reference_id in enumerate(selection.among):
             if reference_id not in entries:
-                if main.indexes.is_damaged(scene_key, reference_id):
-                    message = f"reference {reference_id!r} is damaged in the store: delete it and add it again"
-                    raise DataLoss(message, field=f"references[{index}]")
-                raise reference_not_found(scene_key, reference_id, f"references[{index}]")
+                raise main.indexes.why_missing(scene_key, reference_id, f"references[{index}]")
         if not len(entries):
             return Choice((), "", entries.generation)
         if own is not main:

@@ -20,6 +20,7 @@ from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
 from mapless_server.security import SceneKey
 from mapless_server.store import GroupedScene, Store
+from mapless_server.store.queries import reference_not_found
 
 from .index_files import IndexFiles, Read, again_if_damaged
 from .library import KeyedLocks, Loaded, ReferenceLibrary, load_usable
@@ -175,6 +176,17 @@ class SceneIndexes:
             cached.damaged_ids.discard(reference_id)
             return False
         return True
+
+    def why_missing(self, scene_key: SceneKey, reference_id: str, field: str) -> RequestError:
+        """The error for a named reference that is not among the entries of its scene."""
+        if self.is_damaged(scene_key, reference_id):
+            message = f"reference {reference_id!r} is damaged in the store: delete it and add it again"
+            return DataLoss(message, field=field)
+        missing = reference_not_found(scene_key, reference_id, field)
+        if reference_id not in self._store.list_retirements(scene_key, [reference_id]):
+            return missing
+        message = f"reference {reference_id!r} is retired, so that it is not chosen: restore it, or rerank without it"
+        return NotFound(message, reason="REFERENCE_RETIRED", field=field, resource=missing.resource)
 
     def report_damaged(self, scene_key: SceneKey, reference_id: str, error: Exception) -> None:
         """Logs that a reference is not used because it is damaged; once while the scene is in memory."""
