@@ -214,8 +214,7 @@ class LocalizationResult:
         pose, frame = self.world_from_camera, ""
         if self.in_axes is not None and self.in_axes.axes != "OPENCV":
             pose, frame = self.in_axes.world_from_camera, f"   in {self.in_axes.axes} axes"
-        scene = f" in {_id(self.scene)}" if self.scene else ""
-        text = [f"{_outcome(self, scene)}{frame}", *pose_lines(pose, self.accuracy, self.arbitrary_unit)]
+        text = [f"{_outcome(self, in_scene(self.scene))}{frame}", *pose_lines(pose, self.accuracy, self.arbitrary_unit)]
         if self.geo_pose is not None:
             geo = self.geo_pose
             text.append(f"  on earth  {geo.lat:.7f}, {geo.lon:.7f}, {geo.h:.2f} m")
@@ -276,8 +275,16 @@ class Rejected:
     is_final: bool = field(default=True, init=False)
 
     def __str__(self) -> str:
-        text = [rejection_text(self.reason, self.message, self.hint)]
-        if self.diagnostics.is_among_several and self.scene and self.reason != "AMBIGUOUS":
+        text = [
+            rejection_text(
+                self.reason,
+                self.message,
+                self.hint,
+                self.hypotheses,
+                None if self.diagnostics.is_among_several else self.scene,
+            )
+        ]
+        if self.diagnostics.is_among_several and self.scene and not in_two_scenes(self.hypotheses):
             text.append(f"  of {self.diagnostics.searched_scene_count} scenes, {_id(self.scene)} matched best")
         text += [f"  read with a {it}" for it in _chosen(self.used_intrinsics)]
         for it in (it for it in self.hypotheses if it.accuracy is not None):
@@ -298,14 +305,33 @@ def _missing(diagnostics: Diagnostics) -> list[str]:
     return [it for it in (summary_of_missing(diagnostics.missing_evidence),) if it]
 
 
-def rejection_text(reason: str, message: str, hint: Hint | None) -> str:
-    """A rejection as a few lines."""
-    text = [f"not localized: {reason}", f"  {message}"]
+def rejection_text(
+    reason: str, message: str, hint: Hint | None, hypotheses: tuple[Hypothesis, ...], scene: str | None
+) -> str:
+    """A rejection as a few lines; without its `scene`, of several, references and poses have the name of theirs."""
+    text = [f"not localized{in_scene(scene or '')}: {reason}", f"  {message}"]
+    for it in (it for it in hypotheses if it.accuracy is None):
+        x, y, z = it.world_from_camera.translation
+        where = in_scene(it.scene if scene is None else "")
+        text.append(f"  pose{where}: position  {x:.3f}  {y:.3f}  {z:.3f}, {it.inlier_count} inliers")
     if hint is not None and hint.message:
         text.append(f"  {hint.message}")
     if hint is not None and hint.best_reference:
-        text.append(f"  shares most with reference {_id(hint.best_reference)}")
+        reference = _id(hint.best_reference)
+        if scene is None:
+            reference = hint.best_reference.removeprefix("scenes/").replace("/references/", "/", 1)
+        text.append(f"  shares most with reference {reference}")
     return "\n".join(text)
+
+
+def in_two_scenes(hypotheses: tuple[Hypothesis, ...]) -> bool:
+    """Whether poses are in the worlds of different scenes."""
+    return len({it.scene for it in hypotheses}) > 1
+
+
+def in_scene(scene: str) -> str:
+    """A scene as the end of a phrase; empty without one."""
+    return f" in {_id(scene)}" if scene else ""
 
 
 def pose_lines(pose: RigidTransform, accuracy: Accuracy | None, is_arbitrary: bool) -> list[str]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from .answers import Accuracy, Hint, Hypothesis, PriorCheck, pose_lines, rejection_text
+from .answers import Accuracy, Hint, Hypothesis, PriorCheck, in_scene, pose_lines, rejection_text
 from .axes import Axes, pose_to
 from .depth import DepthImage
 from .diagnostics import Diagnostics
@@ -220,10 +220,17 @@ class GroupRejected:
     scene: str = ""
 
     def __str__(self) -> str:
-        return rejection_text(self.reason, self.message, self.hint)
+        return rejection_text(
+            self.reason,
+            self.message,
+            self.hint,
+            self.hypotheses,
+            None if any(it.diagnostics.is_among_several for it in self.images) else self.scene,
+        )
 
 
 def _support(answer: RigLocalization | SequenceLocalization) -> str:
     trust = "" if answer.trust is None else f", trust {answer.trust:.3f}"
     photographs = f"{len(answer.images)} photographs"
-    return f"localized{trust}: {answer.inlier_count} of {answer.match_count} matches, {photographs}"
+    matches = f"{answer.inlier_count} of {answer.match_count} matches"
+    return f"localized{in_scene(answer.scene)}{trust}: {matches}, {photographs}"

@@ -32,4 +32,7 @@ def parse_labels(texts: Iterable[str], flag: str = "--label") -> dict[str, str]:
             raise ValueError(f"{flag} takes NAME=VALUE, such as site=a, not {text!r}")
         if labels.setdefault(name, value) != value:
             raise ValueError(f"{flag} {name} is given as {labels[name]!r} and as {value!r}: no scene has both")
-    return check_labels(labels)
+    try:
+        return check_labels(labels)
+    except ValueError as error:
+        raise ValueError(f"{flag} {error}") from None

@@ -7,7 +7,7 @@ from support.clients import Played
 from support.planted_answers import diagnostics, localized, rejected, truth
 from support.servers import CAMERA, PHOTO
 
-from mapless import ConnectOptions, wire
+from mapless import ConnectOptions, GroupRejected, Hint, Hypothesis, ImageReport, wire
 from mapless.calls.localization import localize
 from mapless.cli.arguments import make_parser
 from mapless.cli.localize import _group_of
@@ -43,7 +43,10 @@ def test_a_request_names_one_scene_several_or_a_group() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({}, "scene must be its id or name"),
+        ({}, "scene, scenes or group is required"),
+        ({"scenes": []}, "scene, scenes or group is required"),
+        ({"scene": "hall", "with_datum": True}, "with_datum needs group"),
+        ({"group": {"floor": 2}}, "group must have labels of text, 'floor' has '2'"),
         ({"scene": "hall", "group": {}}, "group must not be given together with scene"),
         ({"scenes": ["a"], "group": {}}, "group must not be given together with scenes"),
         ({"scenes": "hall"}, "scenes must be a list"),
@@ -93,6 +96,29 @@ def test_text_names_the_scene_where_it_was_found() -> None:
     assert str(found).startswith("localized in yard, trust 0.400\n")
     assert str(localized(scene="")).startswith("localized, trust 0.400\n")  # of a server before 0.4
     assert "  of 12 scenes, yard matched best\n" in str(rejected(scene="scenes/yard", diagnostics=among(12))) + "\n"
+
+
+def test_text_names_the_scene_where_only_one_was_searched() -> None:
+    assert str(rejected(scene="scenes/yard", diagnostics=among(1))).startswith("not localized in yard: ")
+
+
+def test_references_and_poses_among_scenes_name_theirs() -> None:
+    hint = Hint("judge", "TELL_PLACES_APART", "Name the scene.", "scenes/church/references/0004")
+    places = tuple(Hypothesis(truth(), 50 + i, (), scene=f"scenes/{it}") for i, it in enumerate(("church", "office")))
+    answer = rejected(reason="AMBIGUOUS", scene="scenes/church", hint=hint, hypotheses=places, diagnostics=among(2))
+    text = str(answer).splitlines()
+    assert "  shares most with reference church/0004" in text
+    x, y, z = truth().translation
+    assert f"  pose in office: position  {x:.3f}  {y:.3f}  {z:.3f}, 51 inliers" in text
+    assert not any("matched best" in it for it in text)
+    rig = GroupRejected("AMBIGUOUS", "planted", (ImageReport(0, 0, None, among(2)),), hint, places, scene=answer.scene)
+    assert "  shares most with reference church/0004" in str(rig).splitlines()
+
+
+def test_a_wrong_label_is_of_its_flag() -> None:
+    parsed = make_parser().parse_args(["localize", "photo.jpg", "--group", "s i=a"])
+    with pytest.raises(ValueError, match="--group must have names of"):
+        _group_of(parsed)
 
 
 def test_the_table_of_a_folder_ends_with_scenes() -> None:

@@ -161,6 +161,14 @@ def frames_of(photos: Sequence[bytes]) -> list[SequenceFrame]:
     return [SequenceFrame(photo, CAMERA, at) for photo, at in zip(photos, WALK, strict=False)]
 
 
+def test_the_scene_of_priors_is_a_field_of_the_rig(client: Client) -> None:
+    near = Priors(position=PositionPrior(np.zeros(3), 20.0))
+    images = [replace(it, priors=near) for it in rig_of([PHOTO, PHOTO])]
+    with pytest.raises(InvalidArgument) as error:
+        client.localize_rig(images, group=SITE_A)
+    assert error.value.field == "prior_scene"
+
+
 @pytest.mark.parametrize("where", [{"scenes": ["yard", "hall"]}, {"group": SITE_A}])
 def test_a_rig_is_answered_as_with_its_scene_named(client: Client, where: dict[str, Any]) -> None:
     """Its first photograph shows nothing, so that the second one finds the scene."""

@@ -124,6 +124,8 @@ async def _localize_request(
         ),
     )
     _set_scenes(request, scene, scenes, group, prior_scene)
+    if with_datum and group is None:
+        raise ValueError("with_datum needs group: the labels of the scenes, {} for all")
     if with_datum:
         request.scene_group.with_datum = True
     if references:
@@ -158,8 +160,13 @@ def _set_scenes(
     elif group is not None:
         if not isinstance(group, Mapping):
             raise TypeError(f"group must be labels by name, such as {{'site': 'a'}}, is {shown(repr(group))}")
+        for name, value in group.items():
+            if not (isinstance(name, str) and isinstance(value, str)):
+                raise TypeError(f"group must have labels of text, {name!r} has {shown(repr(value))}")
         request.scene_group.SetInParent()
         request.scene_group.labels.update(group)
+    elif scene == "":
+        raise ValueError("scene, scenes or group is required; group={} is all scenes that the caller may read")
     else:
         request.scene = scene_name(scene)
     if prior_scene:

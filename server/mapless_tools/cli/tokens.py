@@ -38,7 +38,7 @@ def create_command(
     ] = None,
     label: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=VALUE: it is for the scenes with this label, too; if repeated, with all of them."),
+        typer.Option(help="NAME=VALUE: it is for scenes with this label, or all of these, beside those of --scene."),
     ] = None,
     expires: Annotated[str | None, typer.Option(help="When it ends, 2027-01-01T00:00:00Z; default: never.")] = None,
     tokens_file: TokensFile = None,
@@ -53,10 +53,10 @@ def create_command(
     from mapless_server.security import create_token, written_secret
 
     name = _one_name(name, name_flag)
-    labels = _labels(label or []) or None
+    scenes, labels = _limits(scene or [], label or [])
     with _tokens_file(tokens_file) as path:
         ends = _read_time(expires) if expires else None
-        create = partial(create_token, path, name, tenant, role, ends, scenes=scene or None, labels=labels)
+        create = partial(create_token, path, name, tenant, role, ends, scenes=scenes or None, labels=labels or None)
         if output is not None:
             with written_secret(output) as file:
                 file.write(create() + "\n")
@@ -129,15 +129,20 @@ def _limit(scenes: Sequence[str], labels: Mapping[str, str]) -> str:
     return f"  only {' and '.join(words)}" if words else ""
 
 
-def _labels(texts: list[str]) -> dict[str, str]:
-    labels = dict[str, str]()
-    for text in texts:
-        name, separator, value = text.partition("=")
-        if not separator:
-            fail(f"--label takes NAME=VALUE, not {text!r}")
-        if labels.setdefault(name, value) != value:
-            fail(f"--label {name} is given as {labels[name]!r} and as {value!r}: no scene has both")
-    return labels
+def _limits(scenes: list[str], labels: list[str]) -> tuple[list[str], dict[str, str]]:
+    """The ids of `--scene`, each once, and the labels of `--label`."""
+    from mapless.labels import parse_labels
+    from mapless.names import check_id
+
+    try:
+        for it in scenes:
+            check_id(it)
+    except ValueError as error:
+        fail(f"--scene: {error}")
+    try:
+        return list(dict.fromkeys(scenes)), parse_labels(labels)
+    except ValueError as error:
+        fail(str(error))
 
 
 def _read_time(text: str) -> datetime:

@@ -197,10 +197,12 @@ def _options_of(request: pb.LocalizeRigRequest | pb.LocalizeSequenceRequest, cov
 
 @contextmanager
 def _within(path: str) -> Iterator[None]:
-    """Prepends this path to the field of an error."""
+    """Prepends this path to the field of an error, unless that is the scene of all photographs' priors."""
     try:
         yield
     except FieldError as error:
+        if error.field == "prior_scene":
+            raise
         message = str(error).removeprefix(f"{error.field}: ")
         raise FieldError(wire.joined(path, error.field), message) from None
 
