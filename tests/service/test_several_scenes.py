@@ -180,6 +180,19 @@ def test_a_rig_is_answered_as_with_its_scene_named(client: Client, where: dict[s
     np.testing.assert_array_equal(answer.world_from_rig.matrix(), named.world_from_rig.matrix())
 
 
+def test_a_limit_that_leaves_out_the_scene_of_a_rig_rejects_it(client: Client) -> None:
+    """The second photograph's limit is at the yard; the first one finds the hall."""
+    found(client, group=SITE_A)  # by then it is known how far their references reach
+    at_yard = Priors(position=PositionPrior(world_from_other_world(HALL, YARD).translation, 5.0))
+    first, second = rig_of([photograph(it) for it in WALK[:2]])
+    images = [first, replace(second, priors=at_yard)]
+    named = client.localize_rig(images, "hall")
+    answer = client.localize_rig(images, group=SITE_A, prior_scene="hall")
+    assert isinstance(named, GroupRejected)
+    assert isinstance(answer, GroupRejected), str(answer)
+    assert (answer.reason, answer.scene) == (named.reason, "scenes/hall") == ("PRIOR_CONFLICT", "scenes/hall")
+
+
 def test_a_sequence_is_answered_as_with_its_scene_named(client: Client) -> None:
     frames = frames_of([photograph(it) for it in WALK])
     at_hall = Priors(geo_position=GeoPositionPrior(47.0, 8.0, 5.0))
