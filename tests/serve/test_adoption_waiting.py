@@ -8,19 +8,19 @@ from typing import cast
 import numpy as np
 import pytest
 
-from mapless_server.engine.query import Query
+from mapless_server.engine.query import Query, Result
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.scenes.adoption.policy import Evidence
+from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import key_of
 from mapless_server.serve.adoption import adopter
 from mapless_server.serve.adoption import waiting as module
 from mapless_server.serve.adoption.waiting import MAX_WAITING, MAX_WAITING_BYTES, MOST_WAITING_S, Candidate, Waiting
-from mapless_server.store import Store
+from mapless_server.store import Store, adoption
 
 
-def candidate(tenant: str = "one", size_bytes: int = 1, offered_s: float = 0.0) -> Candidate:
-    query = SimpleNamespace(scene_key=key_of(tenant, "room"), photo=SimpleNamespace(size_bytes=size_bytes))
+def candidate(tenant: str = "one", size_bytes: int = 1, offered_s: float = 0.0, mask: bytes = b"") -> Candidate:
+    query = SimpleNamespace(scene_key=key_of(tenant, "room"), photo=SimpleNamespace(size_bytes=size_bytes, mask=mask))
     return Candidate(cast(Query, query), cast(Evidence, None), np.empty((0, 2)), "", offered_s)
 
 
@@ -72,3 +72,29 @@ async def test_a_busy_server_deletes_what_is_too_old(monkeypatch: pytest.MonkeyP
 
 def test_computing_time_is_of_the_tenant_of_the_scene() -> None:
     assert adopter.Adopter._caller(key_of("two", "room")).flow.tenant == "two"
+
+
+async def test_vouchers_are_looked_up_after_changes_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    room, asked = key_of("one", "room"), list[str]()
+    generations = {room: 1}
+
+    def looked_up(_: object, scene_key: str) -> dict[str, float]:
+        asked.append(scene_key)
+        return {}
+
+    monkeypatch.setattr(adoption, "list_expired", lambda *_: [])
+    monkeypatch.setattr(adoption, "list_adopting_scenes", lambda _: dict(generations))
+    monkeypatch.setattr(adoption, "missing_vouchers", looked_up)
+    stored = cast(Store, SimpleNamespace(database=None))
+    its = adopter.Adopter(cast(QueueEngine, None), stored, cast(BackgroundObserver, None), 24.0)
+    for generation, count in ((1, 1), (1, 1), (2, 2)):
+        generations[room] = generation
+        await its.maintain()
+        assert asked == [room] * count
+
+
+async def test_masked_photographs_contradict_nothing() -> None:
+    masked = candidate(mask=b"PNG")
+    its = adopter.Adopter(cast(QueueEngine, None), cast(Store, None), cast(BackgroundObserver, None), 24.0)
+    nothing = cast(Result, None), AdoptionOptions()
+    await its._count_contradictions(masked, cast(adopter.Place, None), masked.answered, *nothing)  # asks no store
