@@ -144,6 +144,12 @@ def test_the_command_takes_a_scene_or_finds_it(
     assert (parsed.scene, parsed.photo.name, parsed.scenes, _group_of(parsed)) == (scene, "photo.jpg", scenes, group)
 
 
+def test_help_shows_that_the_scene_can_be_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        make_parser().parse_args(["localize", "--help"])
+    assert "[scene] photo\n" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("given", ["=a", "site=", "site=a --group site=b"])
 def test_a_group_of_no_label_is_refused(given: str) -> None:
     with pytest.raises(ValueError, match="--group"):

@@ -90,12 +90,21 @@ class Command(Parser):
             return super().parse_known_args(args, namespace)
         flags = [it.partition("=")[0] for it in itertools.takewhile(lambda it: it != "--", args or ())]
         instead = next((it for it in flags if it in self.instead_of_scene), "")
-        scene = next(it for it in self._actions if it.dest == "scene")
+        scene = self._scene()
         scene.nargs, scene.default = (argparse.SUPPRESS, "") if instead else (None, None)
         namespace, left = super().parse_known_args(args, namespace)
         if instead and left:
             self.error(f"SCENE is not taken together with {instead}; left over: {' '.join(left)}")
         return namespace, left
+
+    def format_help(self) -> str:
+        """Shows the argument `scene` as one that can be left out; `parse_known_args` decides anew whether it is."""
+        if self.instead_of_scene:
+            self._scene().nargs = "?"
+        return super().format_help()
+
+    def _scene(self) -> argparse.Action:
+        return next(it for it in self._actions if it.dest == "scene")
 
 
 def all_parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
