@@ -123,9 +123,9 @@ async def _localize_request(
             allow_adoption=allow_adoption,
         ),
     )
-    _set_scenes(request, scene, scenes, group, prior_scene)
     if with_datum and group is None:
         raise ValueError("with_datum needs group: the labels of the scenes, {} for all")
+    _set_scenes(request, scene, scenes, group, prior_scene)
     if with_datum:
         request.scene_group.with_datum = True
     if references:
@@ -162,7 +162,7 @@ def _set_scenes(
             raise TypeError(f"group must be labels by name, such as {{'site': 'a'}}, is {shown(repr(group))}")
         for name, value in group.items():
             if not (isinstance(name, str) and isinstance(value, str)):
-                raise TypeError(f"group must have labels of text, {name!r} has {shown(repr(value))}")
+                raise TypeError(f"group must have labels of text, {name!r} has {value!r}")
         request.scene_group.SetInParent()
         request.scene_group.labels.update(group)
     elif scene == "":
