@@ -25,10 +25,12 @@ def run(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> Run:
 def test_adoption_is_turned_on_changed_and_off(run: Run, client: Client, scene: str) -> None:
     code, text, _ = run("scene", "update", scene, "--adopt")
     assert (code, client.get_scene(scene).adoption) == (0, AdoptionPolicy())
-    assert "at most 4 a place, trust 0.5, within 0.03 (68 %), 30 % surveyed" in text
-    assert run("scene", "update", scene, "--adopt-most", "2", "--adopt-radius", "0.1")[0] == 0
+    assert "at most 4 a place, trust 0.5, within 0.03 m (68 %), 30 % surveyed" in text
+    assert run("scene", "update", scene, "--adopt", "--adopt-most", "2", "--adopt-radius", "0.1")[0] == 0
     assert client.get_scene(scene).adoption == AdoptionPolicy(most_per_place=2, max_radius_m=0.1)
-    code, _, error = run("scene", "update", scene, "--adopt-trust", "2")
+    assert run("scene", "update", scene, "--adopt", "--adopt-trust", "0.7")[0] == 0
+    assert client.get_scene(scene).adoption == AdoptionPolicy(most_per_place=2, max_radius_m=0.1, min_trust=0.7)
+    code, _, error = run("scene", "update", scene, "--adopt", "--adopt-trust", "2")
     assert (code, "min_trust must be 0 to 1, is 2" in error) == (2, True)
     assert run("scene", "update", scene, "--forget", "adoption")[0] == 0
     assert client.get_scene(scene).adoption is None

@@ -1,8 +1,6 @@
 """The flags of the command by which a scene adopts."""
 
 import pytest
-from support.commands import run_client
-from support.servers import RunningServer
 
 from mapless import AdoptionPolicy
 from mapless.cli.adoption import policy_of, policy_text
@@ -24,18 +22,6 @@ def test_values_not_given_stay_as_the_scene_has_them() -> None:
 def test_a_value_alone_does_not_switch_adoption_on(flags: str) -> None:
     with pytest.raises(ValueError, match="need --adopt"):
         given(flags)
-
-
-def test_a_scene_is_updated_with_its_own_values(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> None:
-    def run(*arguments: str) -> str:
-        code, printed, _ = run_client(capsys, "--address", server.address, "scene", *arguments, "--text")
-        assert code == 0
-        return printed
-
-    run("create", "office", "--adopt", "--adopt-most", "8")
-    assert "at most 8 a place, trust 0.5, within 0.1 m (68 %)" in run(
-        "update", "office", "--adopt", "--adopt-radius", "0.1"
-    )
 
 
 def test_the_radius_has_the_scenes_unit() -> None:
