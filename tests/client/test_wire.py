@@ -99,14 +99,14 @@ def test_a_prior_with_too_few_coordinates_is_named() -> None:
 
 
 def test_an_empty_scene_is_named() -> None:
-    with pytest.raises(ValueError, match="scene must be its id or name, is empty"):
+    with pytest.raises(ValueError, match="scene, scenes or group is required"):
         Client("localhost").localize(b"x", CAMERA, "")
 
 
 def test_a_missing_argument_is_reported_by_the_call_s_own_name() -> None:
     with pytest.raises(TypeError, match=r"^add_reference\(\) missing 1 required positional argument: 'reference'"):
         Client("localhost").add_reference("kitchen")  # type: ignore[call-arg]
-    with pytest.raises(ValueError, match="scene must be its id or name"):
+    with pytest.raises(ValueError, match="scene, scenes or group is required"):
         Client("localhost").localize(b"x")
 
 
