@@ -104,8 +104,10 @@ def _check_among(request: pb.LocalizeRequest) -> None:
         GroupedScene(key, 1, 0, partial(KINDS_OF_SCENES.__getitem__, i % len(KINDS_OF_SCENES)))
         for i, key in enumerate(keys)
     ]
-    questions, prior_scene = questions_from_message(request, FoundScenes(scenes), TENANT, lambda _: np.ones(len(keys)))
-    query = query_among(request, ENGINE, questions, prior_scene)
+    found = questions_from_message(request, FoundScenes(scenes), TENANT, lambda _: np.ones(len(keys)))
+    for it in () if found.beyond is None else found.beyond():
+        assert it.scene_key in keys
+    query = query_among(request, ENGINE, found.questions, found.prior_scene)
     asked = query.scenes or [SceneQuestion(query.scene_key, query.narrowing, query.priors)]
     assert {it.scene_key for it in asked} <= set(keys)
     assert len({it.scene_key for it in asked}) == len(asked) >= 1
