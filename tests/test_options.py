@@ -45,7 +45,7 @@ OUTSIDE: dict[str, list[tuple[str, Any]]] = {
         ("min_novelty", 1.5),
         ("explained_share", 0.0),
         ("same_viewpoint_deg", NAN),
-        ("interval_s", -1.0),
+        ("contradicting_days", 0),
     ],
     "scheduling.admission.WorkQueueOptions": [("max_queued_s", 0.0), ("max_bytes", -1)],
 }
