@@ -15,6 +15,7 @@ import numpy as np
 from mapless.cameras import with_slashes
 from mapless.geometry import Array, Camera, Quaternion, RigidTransform
 from mapless.masks import FOLDER as MASKS
+from mapless.names import shown
 from mapless_tools.dataset import Dataset
 
 from ..collecting import Collector, ReadOptions, natural_order, text_lines
@@ -130,7 +131,8 @@ def read(path: Path, options: ReadOptions) -> Dataset:
     lines = text_lines(queries) if queries.is_file() else ()
     tests = {line.strip() for _, line in lines} - {""}  # one a line: COLMAP's names may have spaces
     if unknown := sorted(tests - set(model.images)):
-        collector.notes.append(f"{len(unknown)} names of {queries} are no images of the model, such as {unknown[0]}")
+        first = shown(unknown[0])
+        collector.notes.append(f"{len(unknown)} names of {queries} are no images of the model, such as {first}")
     collector.notes += model.notes
     depths = find_depths(path, images.parent)
     for name in sorted(model.images, key=natural_order):
