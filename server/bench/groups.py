@@ -217,7 +217,7 @@ def said(result: Result) -> str:
 
 
 def measure_many(asked: Asked, folders: Sequence[Folder], scenes: Sequence[SceneKey]) -> Iterator[str]:
-    """What photographs cost among many scenes, and in one of all references, by turns (A B B A)."""
+    """Cost of photographs among many scenes, and in one of all references, by turns (A B B A)."""
     times, found = [], Counter[str]()
     for folder in folders:
         frame = folder.photographs[0]

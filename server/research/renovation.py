@@ -45,7 +45,7 @@ HEAD = (
 
 @dataclass(frozen=True)
 class StepResult:
-    """What became of a step's photographs.
+    """Results of a step's photographs.
 
     Attributes:
         step, piece_share: number of the step, and the share of the pieces that are as they were surveyed.

@@ -1,4 +1,4 @@
-"""What a server of a large scene takes: each part in a process of its own, so that memory is its own."""
+"""Cost of a server of a large scene: each part in a process of its own, so that memory is its own."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ RADIUS_M = 15.0
 
 @dataclass(frozen=True)
 class Made:
-    """What making the file took."""
+    """Cost of making the file."""
 
     cpu_s: float
     wall_s: float
@@ -48,7 +48,7 @@ class Made:
 
 @dataclass(frozen=True)
 class Served:
-    """What using it took.
+    """Cost of using the file.
 
     Attributes:
         start_ms, start_read_mib: from a store and a folder to the first entries, and the bytes read for it.

@@ -46,7 +46,7 @@ _BEING_MADE_S = 10.0
 
 @dataclass(frozen=True)
 class IndexFileOptions:
-    """Which scenes have a file, and when it is made again.
+    """Conditions for a scene's file, and for making it again.
 
     Attributes:
         least_references: smaller scenes are searched exactly, in memory.
@@ -347,7 +347,7 @@ class IndexFiles:
 
 
 def _version_of(path: Path) -> tuple[int, int] | None:
-    """What distinguishes a file from others of its name; None if there is none."""
+    """Distinguishes a file from others of its name; None if there is none."""
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Which scenes a call can reach: those of its tenant, and of them only those that its token is for.
+"""The scenes that a call can reach: those of its tenant, and of them only those that its token is for.
 
 This is the one place that decides it. A scene out of reach is looked up in `NOWHERE`, where no scene is: whatever the
 services do with it ends as it does for a scene that does not exist, after the same work.

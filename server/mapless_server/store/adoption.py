@@ -178,7 +178,7 @@ def set_usefulness(database: Database, usefulness: Mapping[str, float]) -> None:
 
 
 def read_standings(database: Database, keys: Collection[str]) -> dict[str, Standing]:
-    """What photographs said of references, by key; those of which nothing was said are left out."""
+    """Findings of photographs about references, by key; references without any are left out."""
     column = reference_standing.c
     with database.read() as connection:
         found = connection.execute(select(reference_standing).where(column.reference_key.in_(sorted(keys))))

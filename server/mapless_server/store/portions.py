@@ -33,7 +33,7 @@ class IndexedPortion:
 
 @dataclass(frozen=True, eq=False)
 class IndexState:
-    """What an index of a scene is compared with, read at one moment.
+    """The state of a scene that an index is compared with, read at one moment.
 
     Attributes:
         create_time_us: when the scene was created, microseconds since 1970.

@@ -232,7 +232,7 @@ class Adopted:
 
 @dataclass(frozen=True)
 class Standing:
-    """What photographs said of a reference since it was added or restored.
+    """Findings of photographs about a reference since it was added or restored.
 
     Attributes:
         contradiction_count: photographs in a row that should show what it shows, and do not.

@@ -86,7 +86,7 @@ class Refusal(str, Enum):
     DISAGREES = "disagrees"
     """They place it elsewhere than its answer."""
     ELSEWHERE = "elsewhere"
-    """What they do not explain in it shows another place."""
+    """The part that they do not explain shows another place."""
     NOTHING_NEW = "nothing_new"
     """It shows nothing that the references lack."""
     PLACE_FULL = "place_full"
@@ -198,7 +198,7 @@ def should_show(
 
 
 def with_share(standing: Standing, share: float, options: AdoptionOptions) -> Standing:
-    """What is known of a place after another photograph of it, of which surveyed references support this share."""
+    """The knowledge of a place after another photograph, of which surveyed references support this share."""
     mean = share if standing.surveyed_share is None else standing.surveyed_share
     weight = 1 / min(standing.photograph_count + 1, options.remembered)
     mean += weight * (share - mean)

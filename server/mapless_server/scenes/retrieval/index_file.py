@@ -43,7 +43,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 MAGIC = f"mapless index {sys.byteorder[:3]}".encode()
 VERSION = 1
-"""Of the layout. A file of another version is not read, but made again."""
+"""Version of the layout. A file of another one is not read, but made again."""
 
 BLOCK_ROWS = 8
 """Rows with a common checksum. More are verified faster one after the other; fewer, where single rows are wanted."""
@@ -101,7 +101,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Header:
-    """What stands at the beginning of a file.
+    """The beginning of a file.
 
     Attributes:
         identity: what the file is of.

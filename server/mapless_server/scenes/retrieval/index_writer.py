@@ -53,7 +53,7 @@ class Making:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What an index is made of.
+    """The content from which an index is made.
 
     Attributes:
         identity, generation, last_change: see `Header`.

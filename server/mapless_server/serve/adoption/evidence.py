@@ -1,4 +1,4 @@
-"""What an answer says, as far as adoption is concerned: its pose, radii and matches."""
+"""The part of an answer that adoption uses: its pose, radii and matches."""
 
 import numpy as np
 

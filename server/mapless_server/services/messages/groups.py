@@ -123,7 +123,7 @@ def queries_among(
 def _asked(
     request: GroupRequest, list_name: str, bounds: tuple[int, int], asked: Callable[[Photograph], Asked]
 ) -> list[Asked]:
-    """What is asked of each photograph; FieldError with its path in the request."""
+    """Reads the question about each photograph; FieldError with its path in the request."""
     if isinstance(request, pb.LocalizeRigRequest):
         check_capture_time(request)
     messages = getattr(request, list_name)

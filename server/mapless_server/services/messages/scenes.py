@@ -262,7 +262,7 @@ class _ScenePriors:
         return SceneQuestion(scene.scene_key, narrowing, priors, used, scene.generation)
 
     def _given_in(self, index: int) -> tuple[Narrowing, Priors]:
-        """What is given in one scene's world, in that of another; nothing if one of them has no datum."""
+        """Converts what is given in one scene's world to another's; nothing if one of them has no datum."""
         if index == self.prior_index:
             return self.given
         datum, other = self.found.attributes[index].datum, self._prior_datum
