@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from datetime import datetime, timezone
 from types import SimpleNamespace
 from typing import cast
 
@@ -15,6 +16,8 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import key_of
 from mapless_server.serve.adoption import adopter
 from mapless_server.serve.adoption import waiting as module
+from mapless_server.serve.adoption.keeping import Keeper
+from mapless_server.serve.adoption.surveyed import Place, SurveyedLocalizer
 from mapless_server.serve.adoption.waiting import MAX_WAITING, MAX_WAITING_BYTES, MOST_WAITING_S, Candidate, Waiting
 from mapless_server.store import Store, adoption
 
@@ -71,7 +74,7 @@ async def test_a_busy_server_deletes_what_is_too_old(monkeypatch: pytest.MonkeyP
 
 
 def test_computing_time_is_of_the_tenant_of_the_scene() -> None:
-    assert adopter.Adopter._caller(key_of("two", "room")).flow.tenant == "two"
+    assert SurveyedLocalizer.caller(key_of("two", "room")).flow.tenant == "two"
 
 
 async def test_vouchers_are_looked_up_after_changes_only(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,6 +98,7 @@ async def test_vouchers_are_looked_up_after_changes_only(monkeypatch: pytest.Mon
 
 async def test_masked_photographs_contradict_nothing() -> None:
     masked = candidate(mask=b"PNG")
-    its = adopter.Adopter(cast(QueueEngine, None), cast(Store, None), cast(BackgroundObserver, None), 24.0)
-    nothing = cast(Result, None), AdoptionOptions()
-    await its._count_contradictions(masked, cast(adopter.Place, None), masked.answered, *nothing)  # asks no store
+    nobody = cast(BackgroundObserver, None), cast(SurveyedLocalizer, None)
+    its = Keeper(cast(QueueEngine, None), cast(Store, None), *nobody, 24.0)
+    nothing = cast(Result, None), datetime.now(timezone.utc), AdoptionOptions()
+    await its.count_contradictions(masked, cast(Place, None), masked.answered, *nothing)  # asks no store

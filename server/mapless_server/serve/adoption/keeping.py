@@ -1,0 +1,132 @@
+"""Keeps what photographs say of references, retires references by it, and deletes adopted ones that are too old."""
+
+import asyncio
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import datetime, timedelta
+
+from mapless.scenes import AdoptionPolicy
+from mapless_server.engine.query import Result
+from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.errors import NotFound
+from mapless_server.scenes.adoption import policy as rules
+from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
+from mapless_server.scenes.observer import BackgroundObserver
+from mapless_server.security import SceneKey
+from mapless_server.store import RetirementReason, Store, adoption, time_us
+from mapless_server.store.records import Standing
+
+from .surveyed import Place, SurveyedLocalizer
+from .waiting import Candidate
+
+log = logging.getLogger(__name__)
+
+MOST_LOST_SHARE = 0.5
+"""Share of the vouching matches of an adopted reference whose references may be gone."""
+
+
+class Keeper:
+    """Changes what is known of references, and which are chosen."""
+
+    def __init__(
+        self,
+        engine: QueueEngine,
+        store: Store,
+        observer: BackgroundObserver,
+        localizer: SurveyedLocalizer,
+        hours: float,
+    ) -> None:
+        """Makes the object. Adopted references are deleted when they are `hours` old."""
+        self._engine = engine
+        self._store = store
+        self._observer = observer
+        self._localizer = localizer
+        self._hours = hours
+        self._checked: dict[SceneKey, int] = {}
+        """Generations of the scenes at which all that vouches for their adopted references was looked up."""
+
+    async def maintain(self, now: datetime) -> None:
+        """Deletes adopted references that are too old, and retires those whose vouching references are gone."""
+        before = now - timedelta(hours=self._hours)
+        for scene_key, reference_id in await asyncio.to_thread(adoption.list_expired, self._store.database, before):
+            await asyncio.to_thread(self._delete, scene_key, reference_id)
+            self._observer.count("adopted_expired")
+        scenes = await asyncio.to_thread(adoption.list_adopting_scenes, self._store.database)
+        for scene_key, generation in scenes.items():
+            if self._checked.get(scene_key) != generation:
+                lost = await asyncio.to_thread(adoption.missing_vouchers, self._store.database, scene_key)
+                gone = [key for key, share in lost.items() if share > MOST_LOST_SHARE]
+                await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
+        self._checked = scenes
+
+    async def learn(
+        self,
+        candidate: Candidate,
+        place: Place,
+        surveyed: Evidence | None,
+        policy: AdoptionPolicy,
+        options: AdoptionOptions,
+    ) -> bool:
+        """Counts what a photograph says of its place, and of the adopted references there; whether it is outdated."""
+        database, answered, scene_key = self._store.database, candidate.answered, candidate.query.scene_key
+        share = rules.surveyed_share(answered, surveyed)
+
+        def learned(_: str, known: Standing) -> Standing:
+            # Once outdated it stays so until a new survey: answers by what is left of the old one say nothing.
+            # A masked photograph shows what its mask has left.
+            is_left = bool(candidate.query.photo.mask) or rules.is_outdated(known, policy, options)
+            return known if is_left else rules.with_share(known, share, options)
+
+        made = await asyncio.to_thread(adoption.change_standings, database, [place.key], learned)
+        here = [
+            it
+            for it in await asyncio.to_thread(adoption.list_adopted, database, scene_key)
+            if it.place_key == place.key and not it.is_retired
+        ]
+        if any(rules.is_outdated(it, policy, options) for it in made.values()):
+            if await self._retire(scene_key, [it.key for it in here], RetirementReason.SURVEY_OUTDATED):
+                log.warning("scene %s: the place of %s needs a new survey", scene_key, place.reference_id)
+            return True
+        total = max(answered.inlier_count, 1)
+        useful = {
+            it.key: rules.with_usefulness(it.usefulness, answered.inliers_of.get(it.reference_id, 0) / total, options)
+            for it in here
+        }
+        await asyncio.to_thread(adoption.set_usefulness, database, useful)
+        return False
+
+    async def count_contradictions(
+        self,
+        candidate: Candidate,
+        place: Place,
+        surveyed: Evidence,
+        result: Result,
+        now: datetime,
+        options: AdoptionOptions,
+    ) -> None:
+        """Counts what a photograph says of the surveyed references that should show what it shows, and retires some."""
+        if candidate.query.photo.mask:  # what does not show a reference may be all that the mask has left
+            return
+        scene_key, now_us = candidate.query.scene_key, time_us(now)
+        shares = await self._localizer.shares(candidate.query, place, surveyed, result, options)
+        standings = await asyncio.to_thread(
+            adoption.change_standings,
+            self._store.database,
+            shares,
+            lambda key, it: rules.with_photograph(it, shares[key], now_us, candidate.holder, options),
+        )
+        contradicted = [key for key, it in standings.items() if rules.is_contradicted(it, options)]
+        await self._retire(scene_key, contradicted, RetirementReason.CONTRADICTED)
+
+    def _delete(self, scene_key: SceneKey, reference_id: str) -> None:
+        with suppress(NotFound):  # another server was first
+            self._engine.forget_references({self._store.delete_reference(scene_key, reference_id)})
+
+    async def _retire(self, scene_key: SceneKey, keys: Sequence[str], reason: RetirementReason) -> Sequence[str]:
+        """Retires references; returns the keys of those that were not retired before."""
+        if not keys:
+            return []
+        retired = await asyncio.to_thread(adoption.retire, self._store, scene_key, keys, reason)
+        self._observer.count("retirements", len(retired), reason.value)
+        return retired

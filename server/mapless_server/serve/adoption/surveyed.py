@@ -1,0 +1,128 @@
+"""Localizes photographs a second time, from surveyed references alone: all that were not adopted."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapless.axes import Axes
+from mapless.geometry import Array, RigidTransform
+from mapless_server.engine.query import Caller, Query, Result
+from mapless_server.engine.queue_engine import QueueEngine
+from mapless_server.method.bundle.priors import NO_PRIORS
+from mapless_server.method.options import StageContext
+from mapless_server.scenes import ANYWHERE
+from mapless_server.scenes.adoption import policy as rules
+from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
+from mapless_server.scheduling import Flow
+from mapless_server.security import SceneKey, tenant_of
+from mapless_server.services.messages.answers import AnswerFrames, outcome_to_message
+from mapless_server.store import Store, adoption
+
+from .evidence import distance_shown, evidence_of, shares_compared
+
+MOST_CHOSEN_AMONG = 1000
+"""Surveyed references that a photograph is localized from again: the nearest, as many as a request may name."""
+MOST_COMPARED, MOST_SUPPORTING = 6, 4
+"""References that are compared with a photograph only to learn whether it contradicts them, and those beside them."""
+LIMIT_S = 120.0
+"""For each localization; the server is idle."""
+OWN_CALLER = "adoption"
+"""Jobs are the scene's tenant's, from whose share of computing time they are, by a caller of their own."""
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """The references of a scene around a candidate.
+
+    Attributes:
+        surveyed_ids, surveyed_keys, centres, axes: those that were not adopted; centres (N, 3) and axes (N, 3), world.
+        key: of the surveyed one that stands nearest, whose place it is.
+        reference_id: id of that one.
+    """
+
+    surveyed_ids: Sequence[str]
+    surveyed_keys: Sequence[str]
+    centres: Array
+    axes: Array
+    key: str
+    reference_id: str
+
+
+class SurveyedLocalizer:
+    """Localizes photographs of scenes from what was surveyed of them."""
+
+    def __init__(self, engine: QueueEngine, store: Store) -> None:
+        """Makes the object."""
+        self._engine = engine
+        self._store = store
+
+    def place(self, scene_key: SceneKey, pose: RigidTransform) -> Place | None:
+        """The references around a pose; None without surveyed ones."""
+        context = StageContext(lambda: None)
+        entries = self._engine.references.retrievals[0].indexes.entries(scene_key, context, waits=False)
+        adopted = [it.key for it in adoption.list_adopted(self._store.database, scene_key)]
+        rows = np.setdiff1d(entries.rows(), list(entries.rows_of_keys(adopted).values()), assume_unique=True)
+        distance = np.linalg.norm(entries.centres(rows) - pose.translation, axis=1)
+        if len(rows) > MOST_CHOSEN_AMONG:
+            some = np.argpartition(distance, MOST_CHOSEN_AMONG)[:MOST_CHOSEN_AMONG]
+            rows, distance = rows[some], distance[some]
+        chosen = rows[np.argsort(distance, kind="stable")]
+        if not len(chosen):
+            return None
+        centres, axes = entries.centres(chosen), entries.axes(chosen)
+        ids, keys = zip(*(entries.reference(row)[:2] for row in chosen.tolist()), strict=True)
+        nearest = rules.nearest_viewpoint(centres, axes, pose)
+        return Place(ids, keys, centres, axes, keys[nearest], ids[nearest])
+
+    async def localized(
+        self, query: Query, reference_ids: Sequence[str], mask: bytes, *, rerank: bool = True
+    ) -> Result:
+        """The photograph localized from surveyed references alone, without its priors and with another mask.
+
+        Of these references the most similar are used, as usual; all of them without `rerank`.
+        """
+        again = replace(
+            query,
+            reference_ids=tuple(reference_ids),
+            rerank=rerank,
+            photo=replace(query.photo, mask=mask),
+            priors=NO_PRIORS,
+            narrowing=ANYWHERE,
+            attributes=None,
+            allow_coarse=False,
+        )
+        engine = self._engine
+        return await engine.run(engine.query_job(again, self.caller(query.scene_key)))
+
+    @staticmethod
+    def caller(scene_key: SceneKey) -> Caller:
+        """Who computes for a scene that adopts."""
+        return Caller(Flow(tenant_of(scene_key), OWN_CALLER), time.monotonic() + LIMIT_S)
+
+    @staticmethod
+    def evidence(query: Query, result: Result) -> Evidence | None:
+        """The evidence of a result; None for a rejection, or a pose without radii."""
+        response = outcome_to_message(result, query.options, AnswerFrames(Axes.OPENCV, None), query.photo)
+        return evidence_of(response, result)
+
+    async def shares(
+        self, query: Query, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
+    ) -> dict[str, float]:
+        """Share of a photograph's matches with references that should show what it shows, by key.
+
+        Only of references that it was compared with. The nearest of those that were not chosen for its answer are
+        compared now, together with the best of those that were.
+        """
+        pose = surveyed.world_from_camera
+        expected = rules.should_show(place.centres, place.axes, pose, distance_shown(result), options)
+        key_of = {place.surveyed_ids[i]: place.surveyed_keys[i] for i in expected.tolist()}
+        shares = shares_compared(surveyed, result)
+        if left := [it for it in key_of if it not in shares][:MOST_COMPARED]:  # the nearest come first
+            supporting = sorted(surveyed.inliers_of, key=lambda it: -surveyed.inliers_of[it])[:MOST_SUPPORTING]
+            compared = await self.localized(query, [*supporting, *left], query.photo.mask, rerank=False)
+            found = self.evidence(query, compared)
+            if found is not None and found.agrees_with(surveyed):
+                shares = shares_compared(found, compared) | shares
+        return {key: shares[it] for it, key in key_of.items() if it in shares}
