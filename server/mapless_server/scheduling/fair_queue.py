@@ -90,7 +90,7 @@ class FurtherQueue(FairQueue[J]):
     def push(self, job: J, flow: Flow, cost_s: float) -> None:
         """Adds a job behind those of its caller."""
         flow = further(flow)
-        self._shares.enter(flow, caller_credit_s=0.0)
+        self._shares.enter(flow, caller_has_credit=False)
         super().push(job, flow, cost_s)
 
     def remove(self, job: J) -> float:

@@ -36,22 +36,22 @@ class _Member:
         self.active: dict[str, _Member] = {}
         self.idle: OrderedDict[str, _Member] = OrderedDict()
 
-    def begin_s(self, name: str, credit_s: float = CREDIT_S) -> float:
+    def begin_s(self, name: str, has_credit: bool = True) -> float:
         """The `served_s` of a member, or that with which it would begin.
 
         A new one begins with an equal share, so that ever new ones do not keep an old one waiting. One that has had
-        less than others is preferred, but not for all the time that it was away.
+        less than others is preferred, but not for all the time that it was away, and not at all without credit.
         """
         if (member := self.active.get(name)) is not None:
             return member.served_s
         known = self.idle.get(name)
-        return self.equal_s if known is None else max(known.served_s, self.least_s - credit_s)
+        return self.equal_s if known is None else max(known.served_s, self.least_s - CREDIT_S * has_credit)
 
-    def enter(self, name: str, number: int, credit_s: float) -> "_Member":
+    def enter(self, name: str, number: int, has_credit: bool) -> "_Member":
         """Counts a job of a member."""
         member = self.active.get(name)
         if member is None:
-            begin_s = self.begin_s(name, credit_s)
+            begin_s = self.begin_s(name, has_credit)
             member = self.active[name] = self.idle.pop(name) if name in self.idle else _Member()
             member.served_s, member.number = begin_s, number
         member.jobs += 1
@@ -91,11 +91,11 @@ class Shares:
         self._all = _Member()
         self._numbers = itertools.count()
 
-    def enter(self, flow: Flow, caller_credit_s: float = CREDIT_S) -> None:
-        """Counts a job of a client; its caller, if it was away, is preferred by at most so much computing time."""
+    def enter(self, flow: Flow, caller_has_credit: bool = True) -> None:
+        """Counts a job of a client; its caller, if it was away, may be preferred to others, or not."""
         member, number = self._all, next(self._numbers)
-        for name, credit_s in zip(flow, (CREDIT_S, caller_credit_s, CREDIT_S), strict=True):
-            member = member.enter(name, number, credit_s)
+        for name, has_credit in zip(flow, (True, caller_has_credit, True), strict=True):
+            member = member.enter(name, number, has_credit)
 
     def leave(self, flow: Flow) -> None:
         """Undoes `enter`."""

@@ -60,7 +60,8 @@ def _credit() -> Iterator[Row]:
         booked = most_booked(away, cost_s) / (THREADS * WorkQueueOptions().max_queued_s)
         waits = {}
         for tokens in (2, 10):
-            wait_s, answered = returning(tokens)
+            seeds = [returning(tokens, seed=seed) for seed in range(SEEDS)]
+            wait_s, answered = max(it for it, _ in seeds), min(it for _, it in seeds)
             waits[f"beside {tokens} that return"] = f"{wait_s:.1f} s, {100 * answered:.0f} %"
         yield {"credit": f"{value:g} s", **_beside(), **waits, "most booked": f"{booked:.1f} bounds"}
 
