@@ -24,10 +24,11 @@ from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.run import await_features
 from mapless_tools.ingest.formats.cameras import read_folder
 
+from .adopting_server import MetricsPage, free_port
 from .rendered_room.furniture import Quad, Room
 from .rendered_room.photographs import QUERY_CAMERA, Station, look_at, photograph
 from .rendered_room.renovation import SIZE_PX, Renovation
-from .renovation import SCENE, MetricsPage, free_port
+from .renovation import SCENE
 
 MOVE_M = np.array([2.0, 0.0, 0.0])
 PICTURE_M = np.array([2.0, 3.975, 1.35]), np.array([2.9, 4.0, 2.0])

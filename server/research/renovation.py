@@ -1,93 +1,63 @@
 """The demo's room renovated over ten steps: `python -m research.renovation FOLDER`.
 
-Renders into FOLDER what it lacks (ten minutes of processor time), stores the survey, 40 references, in a server of its
+Renders into FOLDER what it lacks (15 minutes of processor time), stores the survey, 40 references, in a server of its
 own with the settings of the environment, and localizes 40 photographs at each step, which is renovated further each
-time (`rendered_room/renovation.py`). Prints Markdown: how many are localized, how far off, how many radii hold, and how
-many right matches with the survey are left: those whose point projects to its keypoint by the true pose. With `--adopt`
-the scene adopts, and after each photograph the server has time to consider it.
+time (`rendered_room/renovation.py`). A step is a week. After the ten steps the surfaces of the building are exchanged
+too, and then the room is surveyed again. All of it twice: without adoption, and with a scene that adopts, where each
+photograph is considered before the next one. Prints Markdown, of which `docs/evidence/renovation.md` consists.
+
+What is left of the survey where a photograph was taken is known from the room's geometry: the share of the surveyed
+points in its view whose surface was neither exchanged nor hidden.
 """
 
 import argparse
-import re
-import socket
+import hashlib
+import json
 import sys
 import tempfile
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
-from urllib.request import urlopen
 
 import numpy as np
 
 from mapless import AdoptionPolicy, Client, LocalizationResult, NewReference, Rejected
-from mapless_tools.child import CONNECT, child_server
+from mapless_tools.child import CONNECT
 from mapless_tools.dataset import Frame
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.run import await_features
 from mapless_tools.ingest.formats.cameras import read_folder
-from mapless_tools.output_files import markdown_table
 
+from .adopting_server import Calendar, MetricsPage, adopting_server
 from .rendered_room.folders import entry_of, write_cameras, write_photograph
 from .rendered_room.photographs import Station
 from .rendered_room.renovation import STEPS, RenovatedRoom, Renovation, survey, visit
+from .rendered_room.survey_left import SurveyedPoints
+from .renovation_tables import Seen, StepResult, report
 
 SCENE = "renovated"
 PHOTOGRAPHS = 40
 RIGHT_PX = 4.0
-"""Farthest projection of the point of a right match, pixels of the photograph."""
-CONSIDERING_S = 300.0
-"""Longest time for considering a photograph; the machine may be busy."""
-HEAD = (
-    "step | pieces left | localized | median | largest | within 68 % | within 95 % | right matches | of the survey left"
-)
+"""Farthest projection of the point of a right match, by the true pose, pixels of the photograph."""
+BUILDING, SURVEYED_AGAIN = STEPS + 1, STEPS + 2
+"""The steps after the ten: the building's surfaces are exchanged, and the same room is surveyed again."""
+DAYS = 7.0
+"""Length of a step."""
 
 
-@dataclass(frozen=True)
-class StepResult:
-    """Results of a step's photographs.
-
-    Attributes:
-        step, piece_share: number of the step, and the share of the pieces that are as they were surveyed.
-        errors_m: of the localized ones.
-        held_68, held_95: localized ones within the radii of their positions.
-        count: all of them.
-        surveyed_matches, matches: right matches a photograph, with surveyed references and with all.
-    """
-
-    step: int
-    piece_share: float
-    errors_m: tuple[float, ...]
-    held_68: int
-    held_95: int
-    count: int
-    surveyed_matches: float
-    matches: float
-
-    def row(self, first: "StepResult") -> list[str]:
-        """A row of the table; the first step has no renovation."""
-        found = len(self.errors_m)
-        errors = [f"{100 * it:.2f} cm" for it in (np.median(self.errors_m), max(self.errors_m))] if found else ["", ""]
-        held = [f"{it} of {found}" for it in (self.held_68, self.held_95)]
-        left = f"{100 * self.surveyed_matches / first.surveyed_matches:.0f} %"
-        shares = [f"{self.matches:.0f}", left]
-        return [str(self.step), f"{100 * self.piece_share:.0f} %", f"{found} of {self.count}", *errors, *held, *shares]
-
-
-def render(folder: Path, seed: int, count: int) -> list[float]:
-    """Renders survey and steps where they are missing; returns the share of pieces that each step has left."""
-    shares, renovation = [], Renovation(seed)
-    for step in range(STEPS + 1):
-        target, share = folder / f"step-{step:02d}", folder / f"step-{step:02d}" / "share"
-        if not share.is_file():
-            room = renovation.at(step)
-            write(target, room, visit(seed, step, count, room))
-            if step == 0:
-                write(folder / "survey", room, survey(seed, room))
-            share.write_text(str(1 - float(np.mean(room.exchanged))))
-            print(f"step {step} rendered", file=sys.stderr, flush=True)
-        shares.append(float(share.read_text()))
-    return shares
+def render(folder: Path, seed: int, count: int) -> None:
+    """Renders surveys and steps where they are missing."""
+    renovation = Renovation(seed)
+    for step in range(SURVEYED_AGAIN + 1):
+        target = folder / f"step-{step:02d}"
+        if (target / "share").is_file():
+            continue
+        room = renovation.at(min(step, BUILDING))
+        write(target, room, visit(seed, step, count, room))
+        if step in (0, SURVEYED_AGAIN):
+            write(folder / ("survey" if step == 0 else "survey-again"), room, survey(seed, room))
+        (target / "share").write_text(str(1 - float(np.mean(room.exchanged))))
+        print(f"step {step} rendered", file=sys.stderr, flush=True)
 
 
 def write(folder: Path, room: RenovatedRoom, stations: Sequence[Station]) -> None:
@@ -97,31 +67,88 @@ def write(folder: Path, room: RenovatedRoom, stations: Sequence[Station]) -> Non
     write_cameras(folder, [entry_of(it) for it in stations])
 
 
-@dataclass(frozen=True)
-class MetricsPage:
-    """The metrics of a server, at a port of this machine."""
+def frames_of(folder: Path, step: int, count: int) -> list[Frame]:
+    """The first photographs of a step."""
+    return list(read_folder(folder / f"step-{step:02d}").frames[:count])
 
-    port: int
 
-    @property
-    def outcomes(self) -> dict[str, int]:
-        """Photographs that were considered, by what became of them."""
-        with urlopen(f"http://127.0.0.1:{self.port}/metrics", timeout=60) as page:
-            found = re.findall(r'mapless_adoptions_total\{result="(\w+)"\} (\S+)', page.read().decode())
-        return {result: round(float(count)) for result, count in found}
+class Run:
+    """A scene in which the photographs are localized step after step."""
 
-    @property
-    def considered(self) -> int:
-        """Photographs that were considered."""
-        return sum(self.outcomes.values())
+    def __init__(self, folder: Path, seed: int, count: int) -> None:
+        """Prepares the photographs in a folder, so many of each step."""
+        self._folder = folder
+        self._frames = [frames_of(folder, step, count) for step in range(SURVEYED_AGAIN + 1)]
+        self._surveyed = SurveyedPoints(seed, read_folder(folder / "survey").frames)
 
-    def wait_for(self, count: int) -> None:
-        """Returns when so many were considered; TimeoutError after `CONSIDERING_S`."""
-        end_s = time.monotonic() + CONSIDERING_S
-        while self.considered < count:
-            if time.monotonic() > end_s:
-                raise TimeoutError(f"the server has considered {self.considered} photographs, not {count}")
-            time.sleep(0.1)
+    def steps(self, client: Client, metrics: MetricsPage, calendar: Calendar, adopts: bool) -> list[StepResult]:
+        """Results of all steps, of a new scene."""
+        client.create_scene(SCENE, adoption=AdoptionPolicy() if adopts else None)
+        self._add(client, "survey", "")
+        results = []
+        for step in range(len(self._frames)):
+            if step == SURVEYED_AGAIN:
+                self._add(client, "survey-again", "again-")
+            page = metrics if adopts else None
+            seen = [self._seen(client, page, calendar, step, i) for i in range(len(self._frames[step]))]
+            results.append(self._result(client, metrics, step, seen))
+        return results
+
+    def _add(self, client: Client, survey: str, prefix: str) -> None:
+        frames = read_folder(self._folder / survey).frames
+        client.add_references(
+            SCENE, [NewReference(prefix + it.name, it.image_path, it.camera, it.world_from_camera) for it in frames]
+        )
+        await_features(client, SCENE)
+
+    def _seen(self, client: Client, metrics: MetricsPage | None, calendar: Calendar, step: int, index: int) -> Seen:
+        """Localizes a photograph; with metrics, returns when it has been considered."""
+        frame = self._frames[step][index]
+        calendar.day = DAYS * (step + index / len(self._frames[step]))
+        before = 0 if metrics is None else metrics.considered
+        answer = client.localize(
+            frame.image_path, frame.camera, SCENE, include_debug=True, allow_adoption=True, timeout_s=300
+        )
+        if metrics is not None and not isinstance(answer, Rejected):
+            metrics.wait_for(before + 1)
+        left = 1.0 if step == SURVEYED_AGAIN else self._surveyed.left(step, frame)
+        return seen_of(frame, answer, left)
+
+    def _result(self, client: Client, metrics: MetricsPage, step: int, seen: Sequence[Seen]) -> StepResult:
+        truth = {image_hash(it): it.world_from_camera for frames in self._frames[: step + 1] for it in frames}
+        errors, held = [], 0
+        for kept in client.list_references(SCENE, only_adopted=True):
+            if kept.retire_time is None and kept.provenance.accuracy is not None:
+                errors.append(pose_error(truth[kept.image_sha256], kept.world_from_camera)[0])
+                held += errors[-1] <= kept.provenance.accuracy.position_95_m
+        result = StepResult(
+            step,
+            float((self._folder / f"step-{step:02d}" / "share").read_text()),
+            tuple(seen),
+            tuple(errors),
+            held,
+            metrics.counts("mapless_retirements_total", "reason"),
+            metrics.outcomes,
+            tuple(client.get_scene(SCENE).warnings),
+        )
+        print(json.dumps(asdict(result)), file=sys.stderr, flush=True)
+        return result
+
+
+def image_hash(frame: Frame) -> str:
+    """SHA-256 of a photograph's file, hexadecimal."""
+    return hashlib.sha256(Path(frame.image_path).read_bytes()).hexdigest()
+
+
+def seen_of(frame: Frame, answer: LocalizationResult | Rejected, survey_left: float) -> Seen:
+    """How a photograph was answered."""
+    surveyed, right = right_matches(frame, answer)
+    if isinstance(answer, Rejected):
+        return Seen(frame.name, survey_left, surveyed, right, rejection=f"{answer.reason}: {answer.message}")
+    error_m = pose_error(frame.world_from_camera, answer.world_from_camera)[0]
+    accuracy = answer.accuracy
+    radii = (0.0, 0.0) if accuracy is None else (accuracy.position_68_m, accuracy.position_95_m)
+    return Seen(frame.name, survey_left, surveyed, right, error_m, *radii)
 
 
 def right_matches(frame: Frame, answer: LocalizationResult | Rejected) -> tuple[int, int]:
@@ -131,74 +158,35 @@ def right_matches(frame: Frame, answer: LocalizationResult | Rejected) -> tuple[
     camera_from_world = frame.world_from_camera.inverse()
     projected = frame.camera.project(camera_from_world.apply(answer.debug.x_in_world))
     is_right = np.linalg.norm(projected - answer.debug.query_px, axis=1) <= RIGHT_PX
-    assert answer.diagnostics is not None
     names = [it.name for it in answer.diagnostics.references]
-    is_surveyed = np.array(["/references/reference-" in it for it in names])[answer.debug.reference]
+    is_surveyed = np.array(["/references/adopted-" not in it for it in names])[answer.debug.reference]
     return int((is_right & is_surveyed).sum()), int(is_right.sum())
 
 
-def measure(
-    client: Client, step: int, piece_share: float, frames: Sequence[Frame], metrics: MetricsPage | None
-) -> StepResult:
-    """Localizes the photographs of a step; with a page of metrics, each is considered before the next one."""
-    errors, held_68, held_95, matches = [], 0, 0, []
-    for frame in frames:
-        before = 0 if metrics is None else metrics.considered
-        answer = client.localize(
-            frame.image_path, frame.camera, SCENE, include_debug=True, allow_adoption=True, timeout_s=300
-        )
-        if metrics is not None and not isinstance(answer, Rejected):
-            metrics.wait_for(before + 1)
-        matches.append(right_matches(frame, answer))
-        if isinstance(answer, Rejected) or answer.accuracy is None:
-            continue
-        errors.append(pose_error(frame.world_from_camera, answer.world_from_camera)[0])
-        held_68 += errors[-1] <= answer.accuracy.position_68_m
-        held_95 += errors[-1] <= answer.accuracy.position_95_m
-    of_survey, of_all = np.mean(matches, axis=0).tolist()
-    return StepResult(step, piece_share, tuple(errors), held_68, held_95, len(frames), of_survey, of_all)
+def measure(folder: Path, seed: int, count: int, adopts: bool) -> list[StepResult]:
+    """Results of all steps, with a server of its own."""
+    calendar, run = Calendar(), Run(folder, seed, count)
+    with (
+        tempfile.TemporaryDirectory(prefix="mapless-") as data_dir,
+        adopting_server(Path(data_dir), calendar) as server,
+        Client(server.address, CONNECT) as client,
+    ):
+        return run.steps(client, MetricsPage(int(server.metrics_address.rpartition(":")[2])), calendar, adopts)
 
 
 def main() -> None:
-    """Prints the table."""
+    """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=0, help="of the room and its renovation")
     parser.add_argument("--photographs", type=int, default=PHOTOGRAPHS, help="of each step, the same ones first")
-    parser.add_argument("--adopt", action="store_true", help="the scene adopts what is localized")
+    parser.add_argument("--only", choices=("without", "with"), help="measure without adoption alone, or with it")
     arguments = parser.parse_args()
-    shares = render(arguments.folder, arguments.seed, arguments.photographs)
-    results: list[StepResult] = []
-    metrics = MetricsPage(free_port()) if arguments.adopt else None
-    flags = {} if metrics is None else {"--metrics-port": str(metrics.port)}
-    with (
-        tempfile.TemporaryDirectory(prefix="mapless-") as data_dir,
-        child_server(Path(data_dir), flags) as server,
-        Client(server.address, CONNECT) as client,
-    ):
-        client.create_scene(SCENE, adoption=AdoptionPolicy() if arguments.adopt else None)
-        references = read_folder(arguments.folder / "survey").frames
-        client.add_references(
-            SCENE, [NewReference(it.name, it.image_path, it.camera, it.world_from_camera) for it in references]
-        )
-        await_features(client, SCENE)
-        for step, share in enumerate(shares):
-            frames = read_folder(arguments.folder / f"step-{step:02d}").frames[: arguments.photographs]
-            results.append(measure(client, step, share, frames, metrics))
-            print(results[-1].row(results[0]), file=sys.stderr, flush=True)
-            if metrics is not None:
-                kept = {it.reference_id: it for it in client.list_references(SCENE, only_adopted=True)}
-                retired = sum(it.retire_time is not None for it in kept.values())
-                print(f"{len(kept)} adopted, {retired} retired, {metrics.outcomes}", file=sys.stderr, flush=True)
-                print("\n".join(client.get_scene(SCENE).warnings), file=sys.stderr, flush=True)
-    print("\n".join(markdown_table(HEAD, [it.row(results[0]) for it in results])))
-
-
-def free_port() -> int:
-    """A port that no program listens on."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
+    folder, seed, count = arguments.folder, arguments.seed, arguments.photographs
+    render(folder, seed, count)
+    for adopts in (False, True):
+        if arguments.only in (None, "with" if adopts else "without"):
+            print(report(measure(folder, seed, count, adopts), adopts=adopts), end="\n\n", flush=True)
 
 
 if __name__ == "__main__":

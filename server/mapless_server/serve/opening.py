@@ -21,9 +21,13 @@ from .startup import StartupError
 if TYPE_CHECKING:
     from mapless_server.engine.queue_engine import QueueEngine
 
+    from .adoption.adopter import Adopter
+
 log = logging.getLogger(__name__)
 
 MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], "QueueEngine"]
+MakeAdopter = Callable[["QueueEngine", Store, Metrics, float], "Adopter"]
+"""Makes what considers photographs as references, which keeps these for so many hours."""
 
 
 def open_store(settings: Settings) -> Store:
@@ -47,3 +51,10 @@ def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateL
     words = "what computes was imported in %.2f s; features and weights were loaded in %.2f s"
     log.info(words, imported_s - begin_s, time.monotonic() - imported_s)
     return engine
+
+
+def make_adopter(engine: QueueEngine, store: Store, metrics: Metrics, hours: float) -> Adopter:
+    """Makes an adopter that goes by the clock of this machine; what it imports is loaded with the engine."""
+    from .adoption.adopter import Adopter
+
+    return Adopter(engine, store, metrics, hours)

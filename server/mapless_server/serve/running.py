@@ -39,7 +39,7 @@ from mapless_server.services.handlers import Services
 from mapless_server.settings import Settings
 from mapless_server.store import Store
 
-from .opening import MakeEngine, make_engine, open_store
+from .opening import MakeAdopter, MakeEngine, make_adopter, make_engine, open_store
 from .startup import StartupError, what_is_missing
 
 if TYPE_CHECKING:
@@ -188,7 +188,11 @@ class Running:
 
 @asynccontextmanager
 async def running_server(
-    settings: Settings, make: MakeEngine = make_engine, store: Store | None = None, listen: Listen = GrpcServer
+    settings: Settings,
+    make: MakeEngine = make_engine,
+    store: Store | None = None,
+    listen: Listen = GrpcServer,
+    adopting: MakeAdopter = make_adopter,
 ) -> AsyncIterator[Running]:
     """Runs a server within a program; it is drained at the end of the block.
 
@@ -201,6 +205,7 @@ async def running_server(
         store: store of the references; opened from the settings if None. Closed at the end, unless the settings'
             protection is rejected.
         listen: function that makes the listener.
+        adopting: function that makes the adopter, for programs in which days pass faster.
 
     Raises:
         StartupError: weights or a device are missing, the data folder or a file cannot be used, a port is taken, or
@@ -208,14 +213,19 @@ async def running_server(
     """
     async with AsyncExitStack() as stack:
         try:
-            running = await _start(stack, settings, make, store, listen)
+            running = await _start(stack, settings, make, store, listen, adopting)
         except (AddressTaken, CaptureError, SecurityError) as error:
             raise StartupError(str(error)) from error
         yield running
 
 
 async def _start(
-    stack: AsyncExitStack, settings: Settings, make: MakeEngine, store: Store | None, listen: Listen
+    stack: AsyncExitStack,
+    settings: Settings,
+    make: MakeEngine,
+    store: Store | None,
+    listen: Listen,
+    adopting: MakeAdopter,
 ) -> Running:
     metrics = Metrics()
     raise_limit()
@@ -262,9 +272,7 @@ async def _start(
     _run_task(stack, stop_serving())
     services.starts("it localizes its first photograph")
     await _warm_up(settings, engine, metrics)
-    from .adoption.adopter import Adopter  # what it imports is loaded by now
-
-    adopter = Adopter(engine, store, metrics, settings.capture_hours)
+    adopter = adopting(engine, store, metrics, settings.capture_hours)
     await services.open(engine, adopter.offer)
     _run_task(stack, adopter.run())
     from .idle import release_when_idle  # what it imports is loaded by now

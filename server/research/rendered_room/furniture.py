@@ -19,6 +19,8 @@ from . import textures as tx
 from .textures import Image, Random, Texture
 
 ROOM_M = np.array([5.0, 4.0, 2.6])
+LOWEST_CAMERA_M = 0.85
+"""What stands lower has no bottom."""
 FACES = {
     "front": ((0, 0, 1), (1, 0, 0), (0, 0, -1)),
     "right": ((1, 0, 1), (0, 1, 0), (0, 0, -1)),
@@ -120,7 +122,7 @@ class Room:
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         pivot = low + size / 2 if about is None else np.append(np.asarray(about, float), 0.0)
         for face, (corner, columns, lines) in FACES.items():
-            if face != "bottom" or low[2] >= 0.85:  # no camera is lower
+            if face != "bottom" or low[2] >= LOWEST_CAMERA_M:
                 start = pivot + turn @ (low + size * corner - pivot)
                 across, down = turn @ (size * columns), turn @ (size * lines)
                 self.panel(start, across, down, (faces or {}).get(face, texture), 650)
