@@ -233,3 +233,35 @@ def test_an_attempt_that_has_begun_goes_on_though_jobs_are_refused(has_begun: bo
     toy.learn("prepare", "slow", 50.0)
     toy.finish(batch, Next((Step("prepare", "slow", "b", "next"),), fallback, has_begun=has_begun))
     assert job.is_over != has_begun
+
+
+def background(toy: Toy) -> AnyJob:
+    """A job that gives way, of two stages."""
+    job = toy.job(client="own")
+    job.gives_way = True
+    toy.scheduler.admit(job, toy.now_s)
+    return job
+
+
+def test_a_job_that_gives_way_has_threads_of_its_own() -> None:
+    """None that jobs in order need, and its later stages wait aside, too."""
+    toy = Toy(low=1)
+    job = background(toy)
+    assert not toy.scheduler.has_work("host")
+    toy.finish(toy.take("host", is_low=True), Next((Step("refine", "toy", "b", 0),)))
+    first = toy.admit(client="first", stage="refine")
+    assert toy.take("host").jobs == (first,)
+    assert not toy.scheduler.has_work("host")
+    toy.finish(toy.take("host", is_low=True), Done(None))
+    assert toy.ending_of(job) is Ending.OK
+
+
+def test_a_job_that_gives_way_takes_no_room() -> None:
+    """Neither while it waits nor while it is computed."""
+    toy, without = Toy(low=1), Toy(low=1)
+    background(toy)
+    toy.take("host", is_low=True)
+    background(toy)
+    for it in (toy, without):
+        it.fill()
+    assert toy.observer.admissions == without.observer.admissions + 2

@@ -113,8 +113,8 @@ class QueueEngine:
         self.queue.answered(caller.flow, is_localized)
 
     def _is_alone(self) -> bool:
-        """Whether the queue has one job only."""
-        return self.queue.job_count == 1
+        """Whether the queue has one job only, beside those that give way."""
+        return self.queue.prompt_count == 1
 
     def query_job(
         self,
@@ -123,12 +123,14 @@ class QueueEngine:
         source: ReferenceSource | None = None,
         *,
         on_better: Callable[[Result], None] | None = None,
+        gives_way: bool = False,
     ) -> SearchJob:
         """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
         `source` replaces the references, for the warm-up. `on_better` is called on the event loop, before the answer,
         with each accepted answer that is better than the ones before while another attempt follows; and, if the query
-        allows it, with the coarse pose, which nothing has checked. The answer does not depend on it.
+        allows it, with the coarse pose, which nothing has checked. The answer does not depend on it. A job that
+        `gives_way` is computed by threads of low priority.
         """
         views = QueryViews(query.photo, self.options.image_limits)
         search = Search.begin(query, source or self.references, views, caller.deadline_s)
@@ -137,7 +139,7 @@ class QueueEngine:
             loop = asyncio.get_running_loop()
             search = search.but(on_better=lambda result: loop.call_soon_threadsafe(on_better, result))
         size_bytes = 0 if query.is_part else query.photo.size_bytes  # which `hold` counts
-        return Job(caller.flow, search.first_step, caller.deadline_s, size_bytes)
+        return Job(caller.flow, search.first_step, caller.deadline_s, size_bytes, gives_way=gives_way)
 
     async def run(self, job: SearchJob) -> Result:
         """Computes a query's job and returns its result."""
@@ -160,10 +162,10 @@ class QueueEngine:
         except Refused as refused:
             raise _refusal(refused) from None
 
-    async def describe(self, photos: Sequence[Photo], caller: Caller) -> list[Description]:
-        """Computes features and descriptors of photographs, in order."""
+    async def describe(self, photos: Sequence[Photo], caller: Caller, *, gives_way: bool = False) -> list[Description]:
+        """Computes features and descriptors of photographs, in order; `gives_way` as of `query_job`."""
         size_bytes = sum(photo.size_bytes for photo in photos)
-        return await self._each(DESCRIBE, photos, self.references.describe, caller, size_bytes)
+        return await self._each(DESCRIBE, photos, self.references.describe, caller, size_bytes, gives_way=gives_way)
 
     async def retrieve(
         self, scene_key: SceneKey, photo: Photo, count: int, narrowing: Narrowing, caller: Caller
@@ -221,6 +223,7 @@ class QueueEngine:
         size_bytes: int,
         most_jobs: int | None = None,
         continues: bool = False,
+        gives_way: bool = False,
     ) -> list[ResultT]:
         """Computes items in several jobs, at most as many as there are threads, so that other jobs run in between."""
         work = ItemList(items, compute)
@@ -228,7 +231,8 @@ class QueueEngine:
         step = Step(stage, stage, stage, work)
 
         def job() -> ItemJob[ItemT, ResultT]:
-            return Job(caller.flow, step, caller.deadline_s, size_bytes // jobs, continues=continues)
+            size = size_bytes // jobs
+            return Job(caller.flow, step, caller.deadline_s, size, continues=continues, gives_way=gives_way)
 
         submissions = [asyncio.ensure_future(self.queue.run(job())) for _ in range(jobs)]
         with _as_request_errors():

@@ -240,6 +240,7 @@ class Job(Generic[PayloadT, ValueT]):
         owner: its owner, once it was admitted.
         continues: whether it completes what other jobs of its call have computed; then it is always admitted, also
             while the server drains, since their work would otherwise be lost.
+        gives_way: whether all of its steps wait aside, and nothing is booked for them: nobody waits for its result.
         used_s: computing time so far.
         fallback: replaces expiry.
         waits_since_s: when it began to wait for the step, by the queue's clock.
@@ -260,6 +261,7 @@ class Job(Generic[PayloadT, ValueT]):
     on_end: Callable[[Ending, ValueT | Exception], None] = lambda *_: None
     records: list[StageRecord] = field(default_factory=list)
     continues: bool = False
+    gives_way: bool = False
     used_s: float = 0.0
     fallback: Fallback[PayloadT, ValueT] | None = None
     waits_since_s: float = 0.0

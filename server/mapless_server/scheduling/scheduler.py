@@ -141,6 +141,8 @@ class Scheduler:
                 job.charged_s = self._charged(job.owner, cost_s.total(), now_s)
         self._observer.admitted(cost_s.total())
         self._ledger.open(job, self._admission.bookable(cost_s))
+        if job.gives_way:
+            self._ledger.set_aside(job)
         self._enqueue(job, cost_s.total(), now_s)
 
     def hold(self, flow: Flow, size_bytes: int, now_s: float) -> None:
@@ -232,7 +234,8 @@ class Scheduler:
         for job in jobs:
             job.begins_until_s = None
             self._timers.set(job)
-            self._ledger.resume(job, self._admission.bookable(self._stage_costs.of(job.step, job.flow, now_s)))
+            if not job.gives_way:
+                self._ledger.resume(job, self._admission.bookable(self._stage_costs.of(job.step, job.flow, now_s)))
         return self._begin(lane, stage, jobs, now_s, is_low)
 
     def _begin(self, lane: Lane, stage: Stage, jobs: tuple[AnyJob, ...], now_s: float, is_low: bool = False) -> Batch:
@@ -352,7 +355,7 @@ class Scheduler:
 
     def _enqueue(self, job: AnyJob, cost_s: float, now_s: float) -> None:
         """Lets a job wait for its step; the cost includes later stages."""
-        if job.flow.caller == FAILING:
+        if job.gives_way or job.flow.caller == FAILING:
             self._enqueue_aside(job, cost_s, job.due_s, now_s)
             return
         job.waits_since_s = now_s

@@ -110,6 +110,12 @@ class WorkQueue:
             return len(self._scheduler.jobs)
 
     @property
+    def prompt_count(self) -> int:
+        """Number of those of them that do not give way."""
+        with self._lock:
+            return sum(not job.gives_way for job in self._scheduler.jobs)
+
+    @property
     def backlog_s(self) -> float:
         """Predicted computing time of the admitted jobs, per thread, of the lane with the most of it."""
         with self._lock:

@@ -101,8 +101,12 @@ class Adopter:
             while True:
                 await self._waiting.arrived(MAINTAINED_S)
                 await self._until_idle()
-                if (candidate := self._waiting.pop()) is not None:
+                if (candidate := self.take()) is not None:
                     await self._guarded(self.consider(candidate), "a photograph could not be considered as a reference")
+
+    def take(self) -> Candidate | None:
+        """Removes and returns the photograph that was offered first; None if none waits."""
+        return self._waiting.pop()
 
     async def _maintain_always(self) -> None:
         while True:
@@ -193,13 +197,13 @@ class Adopter:
     ) -> Refusal | None:
         """Stores a photograph as a reference, in place of the least useful one where its place is full."""
         scene_key, photo = candidate.query.scene_key, candidate.query.photo
-        (found,) = await self._engine.describe([photo], self._localizer.caller(scene_key))
+        (found,) = await self._engine.describe([photo], self._localizer.caller(scene_key), gives_way=True)
         vouchers = sorted(surveyed.inliers_of.items(), key=lambda it: -it[1])[:MOST_VOUCHERS]
         radii = (surveyed.position_68_m, surveyed.position_95_m, surveyed.rotation_68_deg, surveyed.rotation_95_deg)
         share = rules.surveyed_share(candidate.answered, surveyed)
         vouching = tuple(Voucher(name, count) for name, count in vouchers)
         new = NewReference(
-            f"adopted-{hashlib.sha256(photo.image).hexdigest()[:32]}",
+            adopted_id(photo.image),
             photo.image,
             photo.camera,
             surveyed.world_from_camera,
@@ -221,3 +225,8 @@ class Adopter:
         self._engine.references.agreements.changed(scene_key)
         log.info("scene %s adopts %s at the place of %s", scene_key, record.reference_id, place.reference_id)
         return None
+
+
+def adopted_id(image: bytes) -> str:
+    """The id of the reference that a photograph becomes: two servers that adopt it give it the same."""
+    return f"adopted-{hashlib.sha256(image).hexdigest()[:32]}"

@@ -94,7 +94,7 @@ class SurveyedLocalizer:
             allow_coarse=False,
         )
         engine = self._engine
-        return await engine.run(engine.query_job(again, self.caller(query.scene_key)))
+        return await engine.run(engine.query_job(again, self.caller(query.scene_key), gives_way=True))
 
     @staticmethod
     def caller(scene_key: SceneKey) -> Caller:
