@@ -1,0 +1,1 @@
+"""Attacks on scenes that adopt: photographs of faked places, and what becomes of the answers to true ones."""

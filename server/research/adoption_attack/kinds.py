@@ -1,0 +1,186 @@
+"""The kinds of attack: for each, photographs with the camera that the attacker states, and where they were taken."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mapless.geometry import Array, Camera
+
+from ..rendered_room.furniture import Room
+from ..rendered_room.photographs import QUERY_CAMERA, Station, exposed, phone_settings, photograph, shade
+from ..rendered_room.renovation import SIZE_PX, Renovation, survey, visit
+from .prints import PICTURE_M, PICTURES_M, pieces_within, print_before, stations, wall_print, with_moved
+
+CAMERA = QUERY_CAMERA.resized(*SIZE_PX)
+DEVELOPED = 5
+"""Photographs of each station: the attacker's phone exposes them differently."""
+DAYS = 20
+"""Of the slow attack; on each the pictures hang 2 cm further."""
+Pixels = NDArray[np.uint8]
+
+
+class Fake(NamedTuple):
+    """An attacker's photograph (H, W, 3) sRGB, with the station where it was taken, the camera stated, and the day."""
+
+    station: Station
+    pixels: Pixels
+    stated: Camera
+    day: int = 0
+
+
+class Rooms:
+    """The surveyed room, and another one that nobody has surveyed."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self.surveyed: Room = Renovation(seed).at(0)
+        self.foreign: Room = Renovation(seed + 5).at(0)
+
+
+Kind = Callable[[Rooms, int], Iterator[Fake]]
+
+
+def taken(rooms: Sequence[Room], places: Sequence[Station], count: int, day: int = 0) -> Iterator[Fake]:
+    """So many photographs at stations, in these rooms by turns; at each several, by other settings of a phone."""
+    each = -(-count // len(places))
+    for i, it in enumerate(places):
+        finer = it.camera.resized(2 * it.camera.width_px, 2 * it.camera.height_px)
+        light = shade(rooms[i % len(rooms)], finer, it.world_from_camera)
+        for k in range(min(each, count - i * each)):
+            random = np.random.default_rng([day, i, k])
+            yield Fake(it, exposed(light, phone_settings(random), random), it.camera, day)
+
+
+def places_for(count: int) -> int:
+    """Number of stations for so many photographs."""
+    return -(-count // DEVELOPED)
+
+
+def near(middle: Array, farthest_m: float, random: np.random.Generator) -> tuple[Array, Array]:
+    """Centre and target (3,) of a camera before a thing at the wall y = 4."""
+    centre = middle + random.uniform([-0.6, -farthest_m, -0.3], [0.6, -0.8, 0.3])
+    return np.clip(centre, [0.3, 0.5, 0.9], [4.6, 3.1, 2.1]), middle + random.normal(0, 0.15, 3)
+
+
+def poster(rooms: Rooms, count: int, move_m: float) -> Iterator[Fake]:
+    """The largest picture of a wall moved along it, or hung in another room, and photographed from near."""
+    own = with_moved(rooms.surveyed, PICTURE_M, np.array([move_m, 0, 0]))
+    hidden = set(pieces_within(rooms.foreign, *PICTURE_M))
+    other = [it for i, it in enumerate(rooms.foreign.quads) if i not in hidden]
+    picture = [own.quads[-1 - i] for i in range(len(pieces_within(rooms.surveyed, *PICTURE_M)))]
+    foreign = Room(rooms.foreign.random, other + picture, rooms.foreign.boxes, rooms.foreign.outline)
+    middle = (PICTURE_M[0] + PICTURE_M[1]) / 2 + [move_m, 0, 0]
+    places = stations("poster", places_for(count), CAMERA, rooms.seed, partial(near, middle, 1.7))
+    yield from taken([own, foreign], places, count)
+
+
+def pictures(rooms: Rooms, count: int, move_m: float) -> Iterator[Fake]:
+    """All pictures of a wall moved along it, photographed with their true surroundings."""
+    room = with_moved(rooms.surveyed, PICTURES_M, np.array([move_m, 0, 0]))
+    middle = (PICTURES_M[0] + PICTURES_M[1]) / 2
+    places = stations("pictures", places_for(count), CAMERA, rooms.seed, partial(near, middle, 2.6))
+    yield from taken([room], places, count)
+
+
+def glued(rooms: Rooms, count: int, move_m: float) -> Iterator[Fake]:
+    """A print of half of a wall glued over it, moved along it, photographed with its true surroundings."""
+    room = rooms.surveyed
+    sheet = wall_print(room, np.array([1.2, 0.9]), np.array([3.8, 2.2]), 500, move_m)
+    quads = [it for it in room.quads if not _is_behind(it.corner, sheet.corner)]
+    faked = Room(room.random, [*quads, sheet], room.boxes, room.outline)
+    middle = sheet.corner + (sheet.across + sheet.down) / 2
+    places = stations("glued", places_for(count), CAMERA, rooms.seed, partial(near, middle, 2.9))
+    yield from taken([faked], places, count)
+
+
+def _is_behind(corner: Array, sheet: Array) -> bool:
+    """Whether a rectangle's corner would stick out of a sheet on the wall; what stands before it stays."""
+    return bool(corner[1] > sheet[1] - 0.005 and 1.0 < corner[0] < 4.0 and 0.9 < corner[2] < 2.3 and corner[1] < 4.0)
+
+
+def edited(rooms: Rooms, count: int, shift_px: int) -> Iterator[Fake]:
+    """True photographs of which a half is shifted by so many pixels; 0: has half of another photograph."""
+    places = visit(rooms.seed + 50, 0, places_for(count), rooms.surveyed)
+    last: Fake | None = None
+    other: Pixels | None = None
+    for it in taken([rooms.surveyed], places, count):
+        pixels, width = it.pixels.copy(), it.pixels.shape[1]
+        half = slice(width // 2, width)
+        if shift_px:
+            pixels[:, half] = np.roll(it.pixels, shift_px, axis=1)[:, half]
+        else:
+            if last is not None and last.station is not it.station:
+                other = last.pixels
+            pixels[:, half] = (it.pixels[:, ::-1] if other is None else other)[:, half]
+        last = it
+        yield it._replace(pixels=pixels)
+
+
+def reprinted(rooms: Rooms, count: int) -> Iterator[Fake]:
+    """Printed photographs of the surveyed room, held before the camera in another room."""
+    shown = survey(rooms.seed, rooms.surveyed)
+    random = np.random.default_rng([rooms.seed, 12])
+    for i, it in enumerate(visit(rooms.seed + 60, 0, count, rooms.foreign)):
+        of, share = shown[i % len(shown)], random.uniform(0.75, 1.1)
+        sheet = print_before(it, of, rooms.surveyed, random.uniform(0.25, 0.5), share)
+        room = rooms.foreign
+        held = Room(room.random, [*room.quads, sheet], room.boxes, room.outline)
+        yield Fake(it, photograph(held, it, 0), CAMERA)
+
+
+def focal(rooms: Rooms, count: int, factor: float) -> Iterator[Fake]:
+    """True photographs whose stated focal length is wrong by a factor."""
+    stated = replace(CAMERA, focal_x_px=CAMERA.focal_x_px * factor, focal_y_px=CAMERA.focal_y_px * factor)
+    for it in taken([rooms.surveyed], visit(rooms.seed + 70, 0, places_for(count), rooms.surveyed), count):
+        yield it._replace(stated=stated)
+
+
+def drift(rooms: Rooms, count: int) -> Iterator[Fake]:
+    """The pictures of a wall move by 2 cm a day."""
+    middle = (PICTURES_M[0] + PICTURES_M[1]) / 2
+    for day in range(DAYS):
+        room = with_moved(rooms.surveyed, PICTURES_M, np.array([0.02 * day, 0, 0]))
+        each = stations(f"drift-{day:02d}", count // DAYS, CAMERA, rooms.seed + day, partial(near, middle, 2.6))
+        yield from taken([room], each, len(each), day)
+
+
+def flood(rooms: Rooms, count: int) -> Iterator[Fake]:
+    """True photographs with something new pasted into a corner, so that places fill with them."""
+    random = np.random.default_rng([rooms.seed, 13])
+    for it in taken([rooms.surveyed], visit(rooms.seed + 80, 0, places_for(count), rooms.surveyed), count):
+        pixels, (height, width) = it.pixels.copy(), it.pixels.shape[:2]
+        noise = random.integers(0, 255, (height // 16, width // 16, 3), np.uint8)
+        patch = cv2.resize(noise, (width // 2, height // 2), interpolation=cv2.INTER_CUBIC)
+        x, y = random.integers(0, [width // 2, height // 2])
+        pixels[y : y + height // 2, x : x + width // 2] = patch
+        yield it._replace(pixels=pixels)
+
+
+def true(rooms: Rooms, count: int) -> Iterator[Fake]:
+    """True photographs, to compare with."""
+    yield from taken([rooms.surveyed], visit(rooms.seed + 90, 0, places_for(count), rooms.surveyed), count)
+
+
+KINDS: dict[str, Kind] = {
+    "poster": partial(poster, move_m=2.0),
+    "poster-50": partial(pictures, move_m=0.5),
+    "poster-20": partial(pictures, move_m=0.2),
+    "poster-5": partial(pictures, move_m=0.05),
+    "glued-20": partial(glued, move_m=0.2),
+    "glued-5": partial(glued, move_m=0.05),
+    "edited-40": partial(edited, shift_px=40),
+    "edited-10": partial(edited, shift_px=10),
+    "edited-foreign": partial(edited, shift_px=0),
+    "reprinted": reprinted,
+    "focal-105": partial(focal, factor=1.05),
+    "focal-102": partial(focal, factor=1.02),
+    "drift": drift,
+    "flood": flood,
+    "true": true,
+}
+"""By name: the number is of centimetres, pixels or per cent."""
