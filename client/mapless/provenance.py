@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from . import names, wire
 from .answers import Accuracy
 from .v1 import reference_service_pb2 as pb
@@ -15,6 +17,8 @@ LARGEST_M, LARGEST_DEG = 1000.0, 180.0
 """Largest radii of a position and of a rotation."""
 MOST_VOUCHERS = 64
 """Surveyed references that vouch for an adopted one."""
+LEAST_EIGENVALUE = -1e-9
+"""Of the correlations of a covariance that is positive semi-definite: rounding."""
 _SOURCE: wire.ProtoEnum = pb.PoseSource
 
 
@@ -43,14 +47,22 @@ class Provenance:
         surveyed_share: of an adopted one, the share of its photograph's matches that surveyed references supported,
             above 0, at most 1; else 0.
         vouchers: of an adopted one, the surveyed references that its pose rests on, at most 64; else empty.
+        covariance: of the same errors as `accuracy`, which it requires: six rows of six, order x y z rx ry rz, metres
+            (or the scene's unit) and radians about fixed axes of the scene's world, as of an answer; kept as
+            tuples. Adjustments use it, where it is not None, in place of the radii.
     """
 
     source: str = GIVEN
     accuracy: Accuracy | None = None
     surveyed_share: float = 0.0
     vouchers: tuple[Voucher, ...] = ()
+    covariance: Sequence[Sequence[float]] | None = None
 
     def __post_init__(self) -> None:
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", _checked(self.covariance))
+            if self.accuracy is None:
+                raise ValueError("accuracy is required where a covariance is given")
         if self.source in (PLACED, ADOPTED) and self.accuracy is None:
             raise ValueError(f"accuracy is required where the pose was {self.source.lower()}")
         if self.source == ADOPTED:
@@ -72,6 +84,25 @@ class Provenance:
             least = radius
 
 
+def _checked(covariance: object) -> tuple[tuple[float, ...], ...]:
+    """The rows of a covariance; ValueError if it is none, or of errors that are too large."""
+    try:
+        values = np.asarray(covariance, float)
+    except ValueError:  # rows of several lengths
+        values = np.empty(0)
+    if values.shape != (6, 6) or not np.isfinite(values).all():
+        raise ValueError("covariance must be 6x6 finite numbers")
+    deviations = np.sqrt(np.diag(values).clip(min=0))
+    unit = np.where(deviations > 0, deviations, 1.0)  # metres and radians differ by orders of magnitude
+    correlations = values / np.outer(unit, unit)
+    is_symmetric = np.abs(correlations - correlations.T).max() <= 1e-6
+    if not is_symmetric or np.linalg.eigvalsh(correlations).min() < LEAST_EIGENVALUE:
+        raise ValueError("covariance must be symmetric and positive semi-definite")
+    if deviations[:3].max() > LARGEST_M or np.degrees(deviations[3:].max()) > LARGEST_DEG:
+        raise ValueError(f"covariance must have standard deviations of at most {LARGEST_M:g} m and {LARGEST_DEG:g} deg")
+    return tuple(tuple(row) for row in values.tolist())
+
+
 GIVEN_POSE = Provenance()
 """A given pose of unknown accuracy."""
 
@@ -89,6 +120,8 @@ def provenance_to_message(provenance: Provenance) -> pb.Provenance:
     )
     if provenance.accuracy is not None:
         wire.set_numbers(message.accuracy, {it: getattr(provenance.accuracy, it) for it in RADII}, "accuracy")
+    if provenance.covariance is not None:
+        message.covariance.row_major.extend(np.ravel(provenance.covariance).tolist())
     return message
 
 
@@ -102,21 +135,27 @@ def provenance_from_message(message: pb.Provenance, field: str) -> Provenance:
         vouchers = tuple(Voucher(it.reference_id, it.match_count) for it in message.vouchers)
     except ValueError as error:
         raise FieldError(joined(field, "vouchers"), str(error)) from None
+    covariance = _rows(message.covariance.row_major) if message.HasField("covariance") else None
     try:
         source = wire.value_name(_SOURCE.DESCRIPTOR, message.source)
-        return Provenance(source, accuracy, message.surveyed_share, vouchers)
+        return Provenance(source, accuracy, message.surveyed_share, vouchers, covariance)
     except ValueError as error:
         name, _, fault = str(error).partition(" ")
         raise FieldError(joined(field, name), fault) from None
 
 
 def provenance_to_json(provenance: Provenance) -> dict[str, Any] | None:
-    """Provenance as JSON: `source` in small letters, and the radii; None for `GIVEN_POSE` or an unknown source."""
+    """Provenance as JSON: `source` in small letters, radii, rows of the covariance.
+
+    None for `GIVEN_POSE` or an unknown source.
+    """
     if provenance == GIVEN_POSE or provenance.source not in (GIVEN, PLACED, ADOPTED):
         return None
     accuracy = provenance.accuracy
     content: dict[str, Any] = {"source": provenance.source.lower()}
     content |= {} if accuracy is None else {it: getattr(accuracy, it) for it in RADII}
+    if provenance.covariance is not None:
+        content["covariance"] = [list(row) for row in provenance.covariance]
     if provenance.source == ADOPTED:
         content["surveyed_share"] = provenance.surveyed_share
         content["vouchers"] = {it.reference_id: it.match_count for it in provenance.vouchers}
@@ -136,13 +175,30 @@ def provenance_from_json(content: object) -> Provenance:
     if not any(it in content for it in RADII):
         return Provenance(source)
     accuracy = _radii([_number(content, it) for it in RADII])
+    covariance = _rows_of_json(content.get("covariance"))
     if source != ADOPTED:
-        return Provenance(source, accuracy)
+        return Provenance(source, accuracy, covariance=covariance)
     vouchers = content.get("vouchers")
     if not isinstance(vouchers, Mapping) or not all(isinstance(it, int) for it in vouchers.values()):
         raise ValueError("vouchers must be an object with numbers of matches")
     vouching = tuple(Voucher(str(name), count) for name, count in vouchers.items())
-    return Provenance(source, accuracy, _number(content, "surveyed_share"), vouching)
+    return Provenance(source, accuracy, _number(content, "surveyed_share"), vouching, covariance)
+
+
+def _rows(row_major: Sequence[float]) -> tuple[tuple[float, ...], ...]:
+    """Rows of six; the last is shorter where there are not 36 numbers, which `Provenance` refuses."""
+    return tuple(tuple(row_major[i : i + 6]) for i in range(0, len(row_major), 6))
+
+
+def _rows_of_json(content: object) -> tuple[tuple[float, ...], ...] | None:
+    if content is None:
+        return None
+    fault = "covariance must be six lists of six numbers"
+    if not isinstance(content, list) or not all(isinstance(it, list) for it in content):
+        raise ValueError(fault)
+    if any(isinstance(it, bool) or not isinstance(it, int | float) for row in content for it in row):
+        raise ValueError(fault)
+    return tuple(tuple(float(it) for it in row) for row in content)
 
 
 def _number(content: Mapping[Any, object], name: str) -> float:

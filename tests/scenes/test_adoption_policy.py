@@ -29,7 +29,7 @@ def evidence(
     inliers_of: Mapping[str, int] | None = None,
 ) -> Evidence:
     of = {"a": 60, "b": 40} if inliers_of is None else inliers_of
-    return Evidence(pose, radius_m, 2 * radius_m, 0.2, 0.4, trust, count, of)
+    return Evidence(pose, radius_m, 2 * radius_m, 0.2, 0.4, trust, count, of, np.eye(6))
 
 
 @pytest.mark.parametrize(

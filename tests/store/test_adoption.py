@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 
+import numpy as np
 import pytest
 from support.stores import Place, make_reference
 
@@ -19,10 +20,11 @@ HALL = SceneKey("hall")
 ADOPTING = SceneAttributes(adoption=AdoptionPolicy(most_per_place=2))
 VOUCHERS = (Voucher("a", 40), Voucher("b", 20))
 RADII = Accuracy(0.01, 0.02, 0.1, 0.2)
+COVARIANCE = (np.diag([1e-4] * 3 + [1e-6] * 3) + 1e-6 * np.eye(6)[::-1]).tolist()
 
 
 def adopted(name: str, usefulness: float = 0.2, vouchers: tuple[Voucher, ...] = VOUCHERS) -> NewReference:
-    provenance = Provenance("ADOPTED", RADII, 0.5, vouchers)
+    provenance = Provenance("ADOPTED", RADII, 0.5, vouchers, COVARIANCE)
     return replace(make_reference(name), provenance=provenance, place_key="place", usefulness=usefulness)
 
 
@@ -42,7 +44,7 @@ def test_what_vouches_for_an_adopted_reference_is_kept(place: Place) -> None:
         hall(store)
         adoption.adopt(store, HALL, adopted("new"), 9)
     with place.open() as store:
-        assert store.get_reference(HALL, "new").provenance == Provenance("ADOPTED", RADII, 0.5, VOUCHERS)
+        assert store.get_reference(HALL, "new").provenance == Provenance("ADOPTED", RADII, 0.5, VOUCHERS, COVARIANCE)
         assert [it.reference_id for it in store.list_references(HALL, 10, only_adopted=True)] == ["new"]
         assert [it.reference_id for it in store.list_references(HALL, 10)] == ["a", "b", "new"]
         assert adoption.list_adopting_scenes(store.database) == {HALL: store.get_generation(HALL)}

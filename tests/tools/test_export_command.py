@@ -89,7 +89,8 @@ def export_of(
 ) -> list[str]:
     scene, _ = filled
     vouchers = (Voucher("r.0-_A", 30), Voucher("r.2-_A", 20))
-    provenance = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.3, 0.4), 0.75, vouchers)
+    covariance = (np.diag([1e-4] * 3 + [1e-5] * 3) + 1e-6 * np.eye(6)[::-1]).tolist()
+    provenance = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.3, 0.4), 0.75, vouchers, covariance)
     new = NewReference("kept", encode(".png", textured(seed=9)), CAMERA, truth().poses[2], provenance=provenance)
     client.add_reference(scene, new)
     done = run("export", scene, str(folder), *flags, "--address", server.address)

@@ -5,6 +5,7 @@ import json
 import math
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from support.images import encode
 from support.servers import RunningServer
 from typer.testing import Result
 
-from mapless import Accuracy, Client, Provenance, Scene
+from mapless import Accuracy, Client, Provenance, Scene, Voucher
 from mapless.geometry import RigidTransform, rotation_angle_deg
 from mapless_server.images import ANY_SIZE, decode_image
 from mapless_tools.demo.photographs import Photograph, room
@@ -145,6 +146,17 @@ def test_a_scene_with_too_little_is_refused(
     done = extended(server, name, photos)
     assert done.exit_code in (1, 2)
     assert said in done.stderr
+
+
+def test_adopted_references_place_nothing(server: RunningServer, client: Client, photos: Path) -> None:
+    """Of two references one is adopted, which leaves too few."""
+    name = f"adopted-{time.monotonic_ns()}"
+    client.create_scene(name)
+    first, second = (half(it).reference() for it in REFERENCES[:2])
+    client.add_reference(name, first)
+    known = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 1.0, (Voucher(first.reference_id, 30),))
+    client.add_reference(name, replace(second, provenance=known))
+    assert "has one reference: from fewer than 2" in extended(server, name, photos).stderr
 
 
 def test_factors_of_few_references_are_mostly_the_usual_ones() -> None:

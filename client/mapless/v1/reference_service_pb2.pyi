@@ -189,16 +189,18 @@ class PlaceState(_message.Message):
     def __init__(self, surveyed_share: _Optional[float] = ..., photograph_count: _Optional[int] = ..., contradiction_count: _Optional[int] = ...) -> None: ...
 
 class Provenance(_message.Message):
-    __slots__ = ("source", "accuracy", "surveyed_share", "vouchers")
+    __slots__ = ("source", "accuracy", "surveyed_share", "vouchers", "covariance")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
     SURVEYED_SHARE_FIELD_NUMBER: _ClassVar[int]
     VOUCHERS_FIELD_NUMBER: _ClassVar[int]
+    COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     source: PoseSource
     accuracy: _localization_service_pb2.Accuracy
     surveyed_share: float
     vouchers: _containers.RepeatedCompositeFieldContainer[Voucher]
-    def __init__(self, source: _Optional[_Union[PoseSource, str]] = ..., accuracy: _Optional[_Union[_localization_service_pb2.Accuracy, _Mapping]] = ..., surveyed_share: _Optional[float] = ..., vouchers: _Optional[_Iterable[_Union[Voucher, _Mapping]]] = ...) -> None: ...
+    covariance: _localization_service_pb2.PoseCovariance
+    def __init__(self, source: _Optional[_Union[PoseSource, str]] = ..., accuracy: _Optional[_Union[_localization_service_pb2.Accuracy, _Mapping]] = ..., surveyed_share: _Optional[float] = ..., vouchers: _Optional[_Iterable[_Union[Voucher, _Mapping]]] = ..., covariance: _Optional[_Union[_localization_service_pb2.PoseCovariance, _Mapping]] = ...) -> None: ...
 
 class Voucher(_message.Message):
     __slots__ = ("reference_id", "match_count")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mapless import Client, Reference
 from mapless.geometry import Camera, RigidTransform
-from mapless.provenance import UNKNOWN, Provenance
+from mapless.provenance import ADOPTED, UNKNOWN, Provenance
 from mapless_server.images.exif import read_exif
 from mapless_tools.ingest.fetching import fetch_all
 from mapless_tools.ingest.formats.writing import image_name
@@ -44,10 +44,15 @@ def check_scene(scene: str, references: Sequence[Reference]) -> None:
         )
 
 
+def surveyed_of(references: Sequence[Reference]) -> list[Reference]:
+    """The references that were not adopted: what is placed by these may vouch for adopted ones itself."""
+    return [it for it in references if it.provenance.source != ADOPTED]
+
+
 def fetch_references(
-    client: Client, scene: str, folder: Path, wanted: frozenset[str] | None, progress: Progress
+    client: Client, scene: str, folder: Path, wanted: frozenset[str], progress: Progress
 ) -> tuple[list[KnownPicture], dict[str, str]]:
-    """Writes the photographs and masks of references into a folder; None: of all.
+    """Writes the photographs and masks of the references with these ids into a folder.
 
     Also returns the server's messages about damaged ones, by their ids.
     """

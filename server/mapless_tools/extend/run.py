@@ -31,7 +31,7 @@ from mapless_tools.reconstruct.matching import Evidence, pairs_of
 from mapless_tools.reconstruct.pictures import Omitted, Picture, Pictures
 from mapless_tools.reconstruct.run import database_of, gather, made_once
 
-from .existing import KnownPicture, check_scene, fetch_references
+from .existing import KnownPicture, check_scene, fetch_references, surveyed_of
 from .model import Fixed, build_model, read_model
 from .options import ExtendOptions
 from .pairs import pairs_with_references
@@ -63,15 +63,16 @@ def extend(
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     known = client.get_scene(scene)
     references = list(client.list_references(scene, page_size=1000))
-    check_scene(scene, references)
+    surveyed = surveyed_of(references)
+    check_scene(scene, surveyed)
     new, there = _new_pictures(pictures.chosen, references)
     omitted, notes = [*pictures.omitted, *there], [*pictures.notes, *known.warnings]
     placement = Placement((), ())
     if new:
-        wanted, alike = _similar(client, scene, new, len(references), options, progress)
+        wanted, alike = _similar(client, scene, new, surveyed, options, progress)
         found, damaged = fetch_references(client, scene, work / "references", wanted, progress)
         notes += [f"not used: {it}" for it in damaged.values()]
-        check_scene(scene, references if len(found) > 1 else references[: len(found)])
+        check_scene(scene, surveyed if len(found) > 1 else surveyed[: len(found)])
         placement = placed_among(found, new, alike, work, options, progress)
         omitted += placement.omitted
     by_name = {it.name: it for it in new}
@@ -98,16 +99,22 @@ ALREADY = "it is in the scene already"
 
 
 def _similar(
-    client: Client, scene: str, new: Sequence[Picture], count: int, options: ExtendOptions, progress: Progress
-) -> tuple[frozenset[str] | None, dict[str, frozenset[str]]]:
-    """The references of a large scene to use, and those of each photograph; None for all of a small one."""
-    if count + len(new) <= options.reconstruct.pairs.all_below:
-        return None, {}
+    client: Client,
+    scene: str,
+    new: Sequence[Picture],
+    surveyed: Sequence[Reference],
+    options: ExtendOptions,
+    progress: Progress,
+) -> tuple[frozenset[str], dict[str, frozenset[str]]]:
+    """The surveyed references of a scene to use, and in a large one those of each photograph."""
+    ids = frozenset(it.reference_id for it in surveyed)
+    if len(ids) + len(new) <= options.reconstruct.pairs.all_below:
+        return ids, {}
     cameras = {name: it.camera for it in starting_cameras(new, options.reconstruct.lens) for name in it.names}
     alike = {}
     for it in tracked("similar references", new, len(new), progress):
         found = client.retrieve_references(it.path, cameras[it.name], scene, options.similar)
-        alike[it.name] = frozenset(reference.name.rpartition("/")[2] for reference in found)
+        alike[it.name] = ids & {reference.name.rpartition("/")[2] for reference in found}
     return frozenset[str]().union(*alike.values()), alike
 
 

@@ -14,7 +14,7 @@ from mapless_tools.reconstruct.folder import full_disk_named, locked
 from mapless_tools.reconstruct.run import prepare
 from mapless_tools.reconstruct.sources import SourceOptions, read_sources
 
-from .existing import check_scene
+from .existing import check_scene, surveyed_of
 from .options import ExtendOptions
 from .report import lines, to_json, went_well
 from .run import extend, store
@@ -36,7 +36,7 @@ def extend_scene(
     scene, photos, out = target
     with terminable(), connected(connection, settings) as client, progress_bars() as progress:
         references = list(client.list_references(scene, page_size=1000))
-        check_scene(scene, references)
+        check_scene(scene, surveyed_of(references))
         if not is_dry:  # a call that needs the same role as storing, and changes nothing
             next(iter(client.audit_scene(scene, [references[0].reference_id])))
         work = prepare(photos, out)

@@ -10,6 +10,7 @@ from support.scenes import SceneOptions, SyntheticScene, make_scene, random_for
 
 from mapless import Accuracy
 from mapless.geometry import Array, RigidTransform
+from mapless.provenance import GIVEN_POSE, Provenance
 from mapless_server.method.bundle.adjust import adjust_pose
 from mapless_server.method.bundle.bundle import BundleProblem
 from mapless_server.method.bundle.estimate import PoseEstimate
@@ -161,8 +162,11 @@ def test_sizes_of_errors_are_known_beside_unknown_poses() -> None:
     jacobian = random.normal(size=(2000, len(per_unit))) * per_unit
     residuals = jacobian @ (random.normal(size=len(per_unit)) / per_unit) + random.normal(size=len(jacobian))
     sizes = []
-    for stated in (Accuracy(1.0, 1.0, 180.0, 180.0), Accuracy(1000.0, 1000.0, 180.0, 180.0)):
-        errors = pose_errors(centres, rotations, np.zeros(3), 1.0, focal_px, depth_m, None, [stated, None, stated])
+    for off_m in (1.0, 1000.0):
+        stated = Provenance(accuracy=Accuracy(off_m, off_m, 180.0, 180.0))
+        errors = pose_errors(
+            centres, rotations, np.zeros(3), 1.0, focal_px, depth_m, None, [stated, GIVEN_POSE, stated]
+        )
         sizes.append(most_probable(errors, jacobian.T @ jacobian, jacobian.T @ residuals))
     assert sizes[0] == sizes[1]
 

@@ -25,6 +25,7 @@ from support.scenes import CAMERA, SceneOptions, SyntheticScene, make_scene, ran
 
 from mapless.answers import Accuracy
 from mapless.geometry import Array, RigidTransform, Similarity, rotation_from_vector
+from mapless.provenance import GIVEN_POSE, Provenance
 from mapless_server.method.bundle.adjust import adjust_pose, with_covariance
 from mapless_server.method.bundle.dispersion import (
     Dispersion,
@@ -253,13 +254,23 @@ def test_a_stated_accuracy_adds_to_its_reference_alone() -> None:
     centres, rotations, query, errors = planted("stated", 3)
     unit_68 = float(error_radii(np.eye(3), 0.68))
     accuracy = Accuracy(0.02 * unit_68, 1.0, math.degrees(0.003 * unit_68), 9.0)
-    stated = pose_errors(centres, rotations, query, LEVEL_PX, FOCAL_PX, DEPTH_M, stated=[None, accuracy, None])
+    stated = pose_errors(
+        centres,
+        rotations,
+        query,
+        LEVEL_PX,
+        FOCAL_PX,
+        DEPTH_M,
+        stated=[GIVEN_POSE, Provenance(accuracy=accuracy), GIVEN_POSE],
+    )
     added = stated.covariance(0.1, 0.4) - errors.covariance(0.1, 0.4)
     variances = [0.0] * 6 + [0.02**2] * 3 + [0.003**2] * 3 + [0.0] * 6
     np.testing.assert_allclose(added, np.diag(variances), atol=1e-15)
 
 
-PLACED = Accuracy(10 * LEVEL_PX / FOCAL_PX * DEPTH_M, 1.0, math.degrees(10 * LEVEL_PX / FOCAL_PX), 9.0)
+PLACED = Provenance(
+    accuracy=Accuracy(10 * LEVEL_PX / FOCAL_PX * DEPTH_M, 1.0, math.degrees(10 * LEVEL_PX / FOCAL_PX), 9.0)
+)
 """Ten times the structure's noise."""
 
 
@@ -272,7 +283,7 @@ def test_planted_sizes_are_found(own: float, drift: float, placed: int) -> None:
     found = []
     for seed in range(20):
         centres, rotations, query, _ = planted(f"sizes {seed}", 10)
-        stated = [*[PLACED] * placed, *[None] * (10 - placed)]
+        stated = [*[PLACED] * placed, *[GIVEN_POSE] * (10 - placed)]
         errors = pose_errors(centres, rotations, query, LEVEL_PX, FOCAL_PX, DEPTH_M, stated=stated)
         random = random_for("sizes", seed)
         unit = np.append(np.sqrt(np.diag(errors.own)), np.sqrt(np.diag(errors.own))[:6])

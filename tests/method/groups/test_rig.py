@@ -11,7 +11,9 @@ from support.compare import assert_jacobian, assert_pose_close
 from support.groups import NOTHING, caller_pose, images_of, looking
 from support.scenes import CAMERA, SceneOptions, make_scene, random_for
 
+from mapless.answers import Accuracy
 from mapless.geometry import Array, Camera, RigidTransform, Similarity, rotation_from_vector
+from mapless.provenance import ADOPTED, Provenance, Voucher
 from mapless_server.method.bundle.estimate import PoseStage
 from mapless_server.method.bundle.intrinsics import read_as
 from mapless_server.method.bundle.priors import IntrinsicsSigma, PositionPrior, Priors
@@ -106,6 +108,25 @@ def test_the_covariance_contains_what_a_common_focal_length_does() -> None:
     each = [replace(it, intrinsics=replace(sigma, k1=k1)) for it, k1 in zip(images, (1e-6, 2e-6, 3e-6), strict=True)]
     apart = estimate(solve_rig(each, RIG_FROM_CAMERA)).covariance - right.covariance
     assert 0 < np.trace(apart[:3, :3]) < np.trace(added[:3, :3])
+
+
+def test_the_covariance_contains_what_adopted_references_share() -> None:
+    stated = 0.03**2 * np.eye(6)
+    known = Provenance(ADOPTED, Accuracy(0.06, 0.2, 3, 9), 1.0, (Voucher("surveyed", 30),), stated.tolist())
+    images = images_of(random_for("adopted"), CAMERAS)
+    surveyed, adopted = (
+        estimate(solve_rig(it, RIG_FROM_CAMERA)).covariance
+        for it in (images, [_with_provenance(it, known) for it in images])
+    )
+    assert np.trace(surveyed[:3, :3]) < 0.1 * 3 * 0.03**2
+    assert 0.9 < np.trace(adopted[:3, :3]) / (3 * 0.03**2) < 2
+
+
+def _with_provenance(image: GroupImage, provenance: Provenance) -> GroupImage:
+    support = image.answer.support
+    assert support is not None
+    references = tuple(replace(it, provenance=provenance) for it in support.references)
+    return replace(image, answer=replace(image.answer, support=replace(support, references=references)))
 
 
 def _read_as(image: GroupImage, camera: Camera) -> GroupImage:

@@ -40,6 +40,7 @@ from .intrinsics import (
 from .pose_problem import (
     AdjustInput,
     AdjustOptions,
+    PoseUncertainty,
     Solved,
     adjusted_estimate,
     errors_of_pose,
@@ -216,7 +217,7 @@ def _with_priors(alone: PoseEstimate, where: Solved, priors: Priors) -> PoseEsti
     options = where.given.options
     with_priors = replace(where.problem, priors=priors, prior_weight=options.error_inflation**2)
     solved = replace(where, there=optimum(with_priors, where.there, options))
-    found = adjusted_estimate(solved, alone, (alone.covariance, alone.intrinsics))
+    found = adjusted_estimate(solved, alone, PoseUncertainty.of(alone))
     return found and _sharpened(_of_matches(found, len(alone.inliers)), priors)
 
 
@@ -323,13 +324,13 @@ def with_covariance(
     errors = errors_of_pose(solved, terms, is_initial)
     if errors is None:
         return estimate
-    covariance, evidence = errors
+    covariance = errors.covariance
     if is_initial or points_are_predicted:
         centroid = np.mean([it.world_from_camera.translation for it in references], axis=0)
         covariance = covariance + scale_covariance(pose, centroid, scale.deviation)
     covariance = priors.consistent(estimate.prior_checks).sharpened(covariance, pose)
-    found = replace(estimate, covariance=covariance, intrinsics=evidence)
-    if evidence is None:
+    found = replace(errors, covariance=covariance).on(estimate)
+    if errors.intrinsics is None:
         return found
     # The pose stays as it is; but an error is not seen in full before it is estimated.
     estimated = recalibrated(solved, found, NO_PRIORS, terms).intrinsics

@@ -134,6 +134,7 @@ class Dispersion:
         gap: distance to the nearest reference that holds the pose, over the median depth of the points.
         intrinsics: evidence of the data about errors of the intrinsics; empty if the problem has not these unknowns.
         depths: (K, 6) motion by one standard deviation of the factor that a reference's depths share; empty without.
+        by_motions: (6, 6 K) derivatives by left perturbations of the references' given poses.
     """
 
     references: Array
@@ -144,6 +145,7 @@ class Dispersion:
     gap: float
     intrinsics: IntrinsicsEquations
     depths: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    by_motions: Array = field(default_factory=lambda: np.zeros((6, 0)))
 
     def covariance(self, region_factor: float) -> Array:
         """Covariance C_r + f^2 C_p (6, 6)."""
@@ -212,6 +214,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int, with_prio
         _gap(seen, bundle),
         intrinsics,
         _by_depths(seen, to_pose, points),
+        to_pose[:, held] @ prior[held, held],
     )
 
 

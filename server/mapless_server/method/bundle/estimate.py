@@ -87,6 +87,8 @@ class PoseEstimate:
         depth_log10_chance: log10 of the chance that a wrong pose agrees with it so; above 0 if it contradicts the pose.
         motion_covariance: (6, 6) the part of the covariance by the camera's motion during a rolling shutter's read-out;
             None without one.
+        reference_covariance: (6, 6) the part of the covariance by what adopted references are off in common (see
+            `stated`); None without such.
     """
 
     world_from_camera: RigidTransform
@@ -102,6 +104,7 @@ class PoseEstimate:
     depth_check: DepthCheck | None = None
     depth_log10_chance: float = 0.0
     motion_covariance: Array | None = None
+    reference_covariance: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +270,8 @@ def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
     apart, and the square of half of the distance estimates the variance. The jackknife, which is linear at the pose,
     does not see how far halves move that fit as well elsewhere. The distance of a few splits varies, so a share of the
     jackknife's variance is added. Turning and stepping aside look alike, so the whole covariance is multiplied. Errors
-    of the intrinsics, the same in both halves, count in full. An estimate with priors, which halves have not, stays.
+    of the intrinsics and of adopted references, the same in both halves, count in full. An estimate with priors, which
+    halves have not, stays.
     """
     radius_m = accuracy_from_covariance(estimate.covariance).position_68_m
     if estimate.without_priors is not None or not radius_m > 0:
@@ -278,13 +282,14 @@ def with_halves(estimate: PoseEstimate, apart_m: float) -> PoseEstimate:
 
 
 def _shared(estimate: PoseEstimate) -> Array:
-    """The part (6, 6) of the covariance by errors of the intrinsics, which are the same in all halves of the data.
+    """The part (6, 6) of the covariance by errors that are the same in all halves of the data.
 
     Evidence that contradicts the intrinsics may say more than the covariance contains: no more than this counts.
     """
+    by_references = np.zeros((6, 6)) if estimate.reference_covariance is None else estimate.reference_covariance
     if estimate.intrinsics is None:
-        return np.zeros((6, 6))
-    found, total = estimate.intrinsics.pose_covariance, estimate.covariance
+        return by_references
+    found, total = estimate.intrinsics.pose_covariance + by_references, estimate.covariance
     least = max(1.0, *(np.trace(found[part, part]) / np.trace(total[part, part]) for part in (slice(3), slice(3, 6))))
     return np.asarray(found / least)
 

@@ -16,7 +16,7 @@ the distance (the linear variogram: Matheron, Principles of geostatistics, 1963)
 in units of the structure's noise in the image (a shift by depth / focal length, or a rotation by 1 / focal length, for
 each pixel), where d is the median distance between two references that observe the points. So references near the query
 hold it, far ones hold little, and several far ones that are neighbours no more than one of them. A reference whose pose
-has an accuracy of its own, as one that mapless placed, adds the variance that this states to C_ii.
+has an accuracy of its own, as one that mapless placed or adopted, adds what this states to C_ii (see `stated`).
 
 The sizes a and b are the most probable ones under the observations of the references. At the given poses, with points
 and query eliminated from the normal equations of the adjustment, the gradient g of the references' motions has the
@@ -31,8 +31,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.answers import Accuracy
 from mapless.geometry import Array, RigidTransform
+from mapless.provenance import ADOPTED, Provenance
 from mapless_server.bounds import check_bounds
 
 from ..features.limits import INLIER_PX
@@ -42,7 +42,7 @@ from ..structure.model import MIN_ADDED_SHARE, PointMatches, Structure
 from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, free_problem
 from .dispersion import UncertaintyOptions, disperse, dispersed_covariance
-from .estimate import PoseEstimate, PoseStage, Support, accuracy_from_covariance
+from .estimate import PoseEstimate, PoseStage, Support
 from .intrinsics import (
     ContradictionOptions,
     IntrinsicsEvidence,
@@ -52,6 +52,7 @@ from .intrinsics import (
 )
 from .normal_equations import Bundle, Linearized, NormalEquations, Poses
 from .priors import IntrinsicsSigma
+from .stated import common_covariance, stated_covariance
 
 LEAST_EIGENVALUE = 1e-6
 """Directions with a smaller share of the largest eigenvalue are not observed: motions of the references as a whole."""
@@ -209,7 +210,7 @@ def pose_problem(
     observing = np.flatnonzero(np.bincount(tracks.view))[:-1]  # the last is the query
     focal_px = float(np.median([references[i].view.camera.focal_x_px for i in observing]))
     centre, level_px, rotations = world_from_query.translation, structure.noise.level_px, problem.given.rotation
-    stated = [it.provenance.accuracy for it in references]
+    stated = [it.provenance for it in references]
     errors = pose_errors(centres, rotations, centre, level_px, focal_px, depth_m, observing, stated)
     there = problem.at(start)
     matrix, gradient, _ = problem.linearize(there).reduced(LEAST_DAMPING)
@@ -244,22 +245,43 @@ def shares_camera(query: View, references: Sequence[PosedView]) -> bool:
     return 2 * sum(query.has_camera_of(it.view) for it in references) > len(references)
 
 
-def adjusted_estimate(
-    solved: Solved, estimate: PoseEstimate, errors: tuple[Array, IntrinsicsEvidence | None] | None
-) -> PoseEstimate | None:
+@dataclass(frozen=True, eq=False)
+class PoseUncertainty:
+    """The errors of a pose.
+
+    Attributes:
+        covariance: (6, 6), of all errors.
+        intrinsics: evidence about errors of the intrinsics; None without any.
+        by_references: (6, 6) its part by what adopted references are off in common; None without such.
+    """
+
+    covariance: Array
+    intrinsics: IntrinsicsEvidence | None
+    by_references: Array | None = None
+
+    @staticmethod
+    def of(estimate: PoseEstimate) -> "PoseUncertainty":
+        """The errors of an estimate."""
+        return PoseUncertainty(estimate.covariance, estimate.intrinsics, estimate.reference_covariance)
+
+    def on(self, estimate: PoseEstimate) -> PoseEstimate:
+        """An estimate with these errors."""
+        found = replace(estimate, covariance=self.covariance, intrinsics=self.intrinsics)
+        return replace(found, reference_covariance=self.by_references)
+
+
+def adjusted_estimate(solved: Solved, estimate: PoseEstimate, errors: PoseUncertainty | None) -> PoseEstimate | None:
     """Returns the estimate at the optimum; None if it has diverged. `errors` are what `errors_of_pose` returns."""
     pose, options = solved.bundle.world_from_query, solved.given.options
     errors_px = solved.given.with_points(solved.used, solved.bundle.points).errors_px(pose)
     inliers = errors_px < options.inlier_px
     if errors is None or inliers.sum() < max(1, options.min_kept_share * estimate.inliers.sum()):
         return None
-    return PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, errors[0], is_adjusted=True, intrinsics=errors[1])
+    return errors.on(PoseEstimate(pose, PoseStage.REFINED, inliers, errors_px, errors.covariance, is_adjusted=True))
 
 
-def errors_of_pose(
-    solved: Solved, intrinsics: IntrinsicsTerms, is_offset: bool = False
-) -> tuple[Array, IntrinsicsEvidence | None] | None:
-    """A pose's covariance without scale and priors, and the evidence of errors of its intrinsics; None for neither.
+def errors_of_pose(solved: Solved, intrinsics: IntrinsicsTerms, is_offset: bool = False) -> PoseUncertainty | None:
+    """The errors of a pose without those by scale and priors; None if it is not determined.
 
     `is_offset` as for `dispersed_covariance`.
     """
@@ -271,7 +293,12 @@ def errors_of_pose(
     covariance = dispersed_covariance(dispersion, pose, options.uncertainty, is_offset)
     factors = options.error_inflation, options.uncertainty.region_factor
     evidence = intrinsics_evidence(dispersion.intrinsics, intrinsics, options.suspicion, *factors)
-    return (covariance if evidence is None else covariance + evidence.pose_covariance), evidence
+    covariance = covariance if evidence is None else covariance + evidence.pose_covariance
+    references = solved.given.references
+    if not any(it.provenance.source == ADOPTED for it in references):
+        return PoseUncertainty(covariance, evidence)
+    by_references = common_covariance(references, dispersion.by_motions, pose)
+    return PoseUncertainty(covariance + by_references, evidence, by_references)
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,14 +327,14 @@ def pose_errors(
     focal_px: float,
     depth_m: float,
     observing: NDArray[np.intp] | None = None,
-    stated: Sequence[Accuracy | None] = (),
+    stated: Sequence[Provenance] = (),
 ) -> PoseErrors:
     """Computes the parts of the covariance of the errors of K references.
 
     Centres (K, 3) and (3,) of the query are in metres, rotations (K, 3, 3) are camera_from_world. `level_px` is the
     noise of the structure, `depth_m` the median depth of the points. References that are not `observing` points (None
-    for all) may be in another part of the scene, and do not count for d. `stated` are the accuracies that references
-    have of their own, None for those without.
+    for all) may be in another part of the scene, and do not count for d. `stated` says how the poses of references are
+    known, of all or of none.
     """
     unit = level_px / focal_px * np.array([depth_m, 1.0])
     between = np.linalg.norm(centres[:, None] - centres, axis=2)
@@ -316,20 +343,8 @@ def pose_errors(
     spacing = max(float(np.median(distances)) if distances else 0.0, LEAST_SPACING * depth_m)
     drift = (to_query[:, None] + to_query - between) / (2 * spacing)
     own = _of_motions(np.eye(len(centres)), rotations, unit)
-    return PoseErrors(own, _of_motions(drift, rotations, unit), _stated(stated))
-
-
-def _stated(accuracies: Sequence[Accuracy | None]) -> Array | None:
-    """Covariance (6 K, 6 K) of errors as large along each axis as the radii of 68 % say; None without any."""
-    if not any(accuracies):
-        return None
-    unit = accuracy_from_covariance(np.eye(6))
-    ratios = [
-        (it.position_68_m / unit.position_68_m, it.rotation_68_deg / unit.rotation_68_deg) if it else (0.0, 0.0)
-        for it in accuracies
-    ]
-    variances = np.square(ratios)
-    return np.diag(np.repeat(variances, 3, axis=1).ravel())
+    its_own = stated_covariance(stated, rotations) if any(it.accuracy for it in stated) else None
+    return PoseErrors(own, _of_motions(drift, rotations, unit), its_own)
 
 
 def _of_motions(covariance: Array, rotations: Array, unit: Array) -> Array:

@@ -10,11 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
+from mapless.provenance import ADOPTED
 
 from ..bundle.bundle import BundleProblem, free_problem
 from ..bundle.normal_equations import Bundle, Linearized, NormalEquations, Poses
 from ..bundle.pose_problem import AdjustOptions, most_probable, pose_errors, with_intrinsics
 from ..bundle.priors import Priors
+from ..bundle.stated import common_motion
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import LEAST_DAMPING, solve_step, world_jacobian
@@ -209,7 +211,7 @@ class GroupProblem(Generic[S]):
         size = block.level_px, focal_px, block.depth_m
         centre = bundle.world_from_query.translation
         its = given[block.references]
-        stated = [reference.provenance.accuracy for _, reference in self._references.values()]
+        stated = [reference.provenance for _, reference in self._references.values()]
         its_stated = [stated[i] for i in block.references]
         errors = pose_errors(its.centres, its.rotation, centre, *size, observing, its_stated)
         matrix, gradient, _ = block.problem.linearize(block.problem.at(bundle)).reduced(LEAST_DAMPING)
@@ -279,7 +281,7 @@ class GroupProblem(Generic[S]):
         """Covariance (N, N) of the parameters; infinite on the diagonal for unobserved ones.
 
         The standard deviations of the observations are inflated (see AdjustOptions.error_inflation), those of the
-        priors and of the parameters' cost are not.
+        priors and of the parameters' cost are not. What adopted references are off in common is added (see `stated`).
         """
         inflation = ADJUST.error_inflation
         matrix, _ = self._prior_equations(point, data_inflation=inflation)
@@ -300,6 +302,11 @@ class GroupProblem(Generic[S]):
                 gradient = gradient - coupling.T @ known
             motion = inverse @ gradient
             covariance = covariance + (motion * variances) @ motion.T
+        its = [reference for _, reference in self._references.values()]
+        if any(it.provenance.source == ADOPTED for it in its):
+            held = self.information @ common_motion(its) / inflation**2
+            by_common = inverse @ coupling.T @ np.linalg.solve(matrix[:references, :references], held)
+            covariance = covariance + by_common @ by_common.T
         return covariance
 
     def _by_intrinsics(self, point: Point[S]) -> Iterator[tuple[Array, Array]]:

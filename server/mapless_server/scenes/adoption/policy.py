@@ -105,6 +105,7 @@ class Evidence:
         trust: its trust.
         inlier_count: matches that agree with it.
         inliers_of: the same for each reference that has some, by id.
+        covariance: (6, 6) that the radii are of, order x y z rx ry rz, metres and radians, fixed world axes.
     """
 
     world_from_camera: RigidTransform
@@ -115,6 +116,7 @@ class Evidence:
     trust: float
     inlier_count: int
     inliers_of: Mapping[str, int]
+    covariance: Array
 
     def agrees_with(self, other: "Evidence") -> bool:
         """Whether both are one pose, within the hypotenuses of their 95 % radii, doubled: they share matches."""

@@ -194,10 +194,15 @@ class Comparison:
     def severity(
         self, noise_m: float = 0.0, noise_deg: float = 0.0, world_from_camera: RigidTransform | None = None
     ) -> float:
-        """Distance of a pose, by default the fitted one, from the given one, as a multiple of the tolerance."""
+        """Distance of a pose, by default the fitted one, from the given one, as a multiple of the tolerance.
+
+        What the given pose states of its own errors, at 95 %, is tolerated.
+        """
         sigma, noise = SIGNIFICANCE_SIGMA, _NEIGHBOUR_NOISE
-        allowed_m = max(POSITION_TOLERANCE_M, sigma * self.sigma_m, noise * noise_m)
-        allowed_deg = max(ROTATION_TOLERANCE_DEG, sigma * self.sigma_deg, noise * noise_deg)
+        stated = self.subject.provenance.accuracy
+        own_m, own_deg = (stated.position_95_m, stated.rotation_95_deg) if stated else (0.0, 0.0)
+        allowed_m = max(POSITION_TOLERANCE_M, sigma * self.sigma_m, noise * noise_m, own_m)
+        allowed_deg = max(ROTATION_TOLERANCE_DEG, sigma * self.sigma_deg, noise * noise_deg, own_deg)
         off_m, off_deg = self.distance(world_from_camera or self.world_from_camera)
         return max(off_m / allowed_m, off_deg / allowed_deg)
 

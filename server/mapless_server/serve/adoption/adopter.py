@@ -199,7 +199,7 @@ class Adopter:
         scene_key, photo = candidate.query.scene_key, candidate.query.photo
         (found,) = await self._engine.describe([photo], self._localizer.caller(scene_key), gives_way=True)
         vouchers = sorted(surveyed.inliers_of.items(), key=lambda it: -it[1])[:MOST_VOUCHERS]
-        radii = (surveyed.position_68_m, surveyed.position_95_m, surveyed.rotation_68_deg, surveyed.rotation_95_deg)
+        radii = surveyed.position_68_m, surveyed.position_95_m, surveyed.rotation_68_deg, surveyed.rotation_95_deg
         share = rules.surveyed_share(candidate.answered, surveyed)
         vouching = tuple(Voucher(name, count) for name, count in vouchers)
         new = NewReference(
@@ -210,7 +210,7 @@ class Adopter:
             found.views,
             found.descriptors,
             photo.mask,
-            Provenance(ADOPTED, Accuracy(*radii), share, vouching),
+            Provenance(ADOPTED, Accuracy(*radii), share, vouching, surveyed.covariance.tolist()),
             place_key=place.key,
             usefulness=options.first_usefulness,
         )

@@ -29,6 +29,7 @@ def evidence_of(response: pb.LocalizeResponse, result: Result) -> Evidence | Non
         answer.outcome.trust or 0.0,
         answer.outcome.inlier_count,
         {name: count for name, count in counts if count},
+        np.reshape(localization.covariance.row_major, (6, 6)),
     )
 
 
