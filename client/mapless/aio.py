@@ -13,7 +13,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, TypeVar
 
-from .calls import adoption, health, localization, references
+from .calls import adoption, health, localization, references, reports
 from .connection import IN_FLIGHT, Connection, ItemT
 from .errors import MaplessError
 from .options import ConnectOptions
@@ -81,6 +81,7 @@ class Client(Connection):
     retrieve_references = references.retrieve_references
     audit_scene = references.audit_scene
     check_coverage = references.check_coverage
+    get_scene_report = reports.get_scene_report
 
     async def unblocked(self, function: Callable[..., T], *arguments: Any) -> T:
         """Calls a function in another thread."""

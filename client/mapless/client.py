@@ -10,7 +10,7 @@ from functools import wraps
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from .calls import adoption, health, localization, references
+from .calls import adoption, health, localization, references, reports
 from .connection import IN_FLIGHT, Connection, ItemT
 from .errors import MaplessError
 from .options import ConnectOptions
@@ -117,6 +117,7 @@ class Client(Connection):
     retrieve_references = _blocking(references.retrieve_references)
     audit_scene = _iterated(references.audit_scene)
     check_coverage = _blocking(references.check_coverage)
+    get_scene_report = _blocking(reports.get_scene_report)
 
     async def pipelined(
         self, call: Callable[[ItemT], Coroutine[Any, Any, T]], items: Iterator[ItemT]

@@ -106,6 +106,8 @@ namespace Mapless
             MethodOf(ReferenceService, "RetrieveReferences", RetrieveReferencesRequest.Parser, RetrieveReferencesResponse.Parser);
         private static readonly Method<AuditSceneRequest, AuditSceneResponse> AuditSceneMethod =
             MethodOf(ReferenceService, "AuditScene", AuditSceneRequest.Parser, AuditSceneResponse.Parser);
+        private static readonly Method<GetSceneReportRequest, GetSceneReportResponse> GetSceneReportMethod =
+            MethodOf(ReferenceService, "GetSceneReport", GetSceneReportRequest.Parser, GetSceneReportResponse.Parser);
         private static readonly Method<CheckCoverageRequest, CheckCoverageResponse> CheckCoverageMethod =
             MethodOf(ReferenceService, "CheckCoverage", CheckCoverageRequest.Parser, CheckCoverageResponse.Parser);
         private static readonly Method<LocalizeRequest, LocalizeProgressivelyResponse> LocalizeProgressivelyMethod =
@@ -480,6 +482,13 @@ namespace Mapless
             AuditSceneRequest request, TimeSpan timeout, CancellationToken cancellation = default)
         {
             return CallAsync(AuditSceneMethod, request, request.Scene, timeout, cancellation);
+        }
+
+        /// <summary>How photographs of a scene were answered, and where references would help.</summary>
+        public Task<GetSceneReportResponse> GetSceneReportAsync(
+            GetSceneReportRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(GetSceneReportMethod, request, request.Scene, timeout, cancellation);
         }
 
         /// <summary>Whether a photograph at a pose would be localized.</summary>

@@ -123,6 +123,8 @@ class Settings(BaseModel):
     """Space of captured calls on the disk, MiB; the oldest are deleted first."""
     capture_tenants: str = ""
     """Tenants whose calls are captured, separated by commas; empty: all."""
+    report_days: int = Field(default=400, ge=0, le=4000)
+    """Days for which answered photographs are counted by scene, place and reason, for reports; 0: they are not."""
     warm_up: bool = True
     """Whether to localize a photograph before the first call is accepted."""
     drain_delay_s: float = Field(default=0.0, ge=0)

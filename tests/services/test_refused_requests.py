@@ -64,6 +64,7 @@ GOOD: dict[str, Message] = {
     "WatchQueries": pb.WatchQueriesRequest(scene=SCENE),
     "RetrieveReferences": reference_pb.RetrieveReferencesRequest(scene=SCENE, image=PHOTO, intrinsics=INTRINSICS),
     "AuditScene": reference_pb.AuditSceneRequest(scene=SCENE),
+    "GetSceneReport": reference_pb.GetSceneReportRequest(scene=SCENE),
     "CheckCoverage": reference_pb.CheckCoverageRequest(scene=SCENE, world_from_camera=AT, intrinsics=INTRINSICS),
     "BatchCreateReferences": reference_pb.BatchCreateReferencesRequest(scene=SCENE, requests=[new("n0"), new("n1")]),
     "CreateReference": new("n"),
@@ -220,6 +221,7 @@ BAD: dict[str, list[Case]] = {
     ],
     "DeleteReference": [("name", "scenes/../references/x")],
     "RestoreReference": [("name", "scenes/../references/x")],
+    "GetSceneReport": [("scene", "s"), ("first_day", "today"), ("last_day", "2026-13-01"), ("days_per_period", 367)],
     "CreateScene": [
         ("scene_id", ".."),
         ("datum.latitude_deg", 91.0),

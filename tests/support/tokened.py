@@ -47,6 +47,7 @@ def requests_on(scene_id: str, reference_id: str = "r", new_id: str = "r") -> di
         "CheckCoverage": reference_pb.CheckCoverageRequest(
             scene=scene, world_from_camera=at, intrinsics=new.reference.intrinsics
         ),
+        "GetSceneReport": reference_pb.GetSceneReportRequest(scene=scene),
         "UpdateScene": reference_pb.UpdateSceneRequest(scene=known, update_mask={"paths": ["down_in_world"]}),
         "RestoreReference": reference_pb.RestoreReferenceRequest(name=reference),
         "DeleteReference": reference_pb.DeleteReferenceRequest(name=reference),

@@ -10,7 +10,7 @@ from mapless_command.installation import how_to_install
 
 from ..client import Client
 from ..shortcut import default_address
-from . import adoption, commands, doctor
+from . import adoption, commands, doctor, report
 from .parsing import COMMON_DEFAULTS, Command, Parser, add_common, all_parsers
 from .photographs import COUNT_DEFAULT, MASK, add_depth, add_limits, add_localize, count
 
@@ -57,7 +57,7 @@ def make_parser() -> argparse.ArgumentParser:
         "else 1.",
     )
     health.set_defaults(run=commands.health)
-    _add_scene(groups.add_parser("scene", help="create, update, get, list, delete"))
+    _add_scene(groups.add_parser("scene", help="create, update, get, report, list, delete"))
     _add_reference(groups.add_parser("reference", help="add, show, download, list, delete, restore"))
     add_localize(groups.add_parser("localize", help="localize a photograph, or a folder of them"))
     _add_questions(groups)
@@ -127,6 +127,7 @@ def _add_scene(scene: argparse.ArgumentParser) -> None:
         if action == "delete":
             _add_yes(one)
         one.set_defaults(run=run)
+    report.add_report(actions)
     listing = actions.add_parser("list", help="all scenes")
     _add_labels(listing, "only scenes with this label; may be repeated")
     listing.set_defaults(run=commands.list_scenes)

@@ -32,6 +32,12 @@ class AuditVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     AUDIT_VERDICT_DOUBTFUL_DEPTH: _ClassVar[AuditVerdict]
     AUDIT_VERDICT_RETIRED: _ClassVar[AuditVerdict]
 
+class ReferenceEventKind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    REFERENCE_EVENT_KIND_UNSPECIFIED: _ClassVar[ReferenceEventKind]
+    REFERENCE_EVENT_KIND_ADOPTED: _ClassVar[ReferenceEventKind]
+    REFERENCE_EVENT_KIND_RETIRED: _ClassVar[ReferenceEventKind]
+
 class CoverageVerdict(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     COVERAGE_VERDICT_UNSPECIFIED: _ClassVar[CoverageVerdict]
@@ -54,6 +60,9 @@ AUDIT_VERDICT_UNVERIFIABLE: AuditVerdict
 AUDIT_VERDICT_WRONG_DEPTH: AuditVerdict
 AUDIT_VERDICT_DOUBTFUL_DEPTH: AuditVerdict
 AUDIT_VERDICT_RETIRED: AuditVerdict
+REFERENCE_EVENT_KIND_UNSPECIFIED: ReferenceEventKind
+REFERENCE_EVENT_KIND_ADOPTED: ReferenceEventKind
+REFERENCE_EVENT_KIND_RETIRED: ReferenceEventKind
 COVERAGE_VERDICT_UNSPECIFIED: CoverageVerdict
 COVERAGE_VERDICT_LOCALIZABLE: CoverageVerdict
 COVERAGE_VERDICT_DOUBTFUL: CoverageVerdict
@@ -501,6 +510,134 @@ class ReferenceAudit(_message.Message):
     other: str
     provenance: Provenance
     def __init__(self, name: _Optional[str] = ..., verdict: _Optional[_Union[AuditVerdict, str]] = ..., message: _Optional[str] = ..., neighbour_count: _Optional[int] = ..., match_count: _Optional[int] = ..., inlier_count: _Optional[int] = ..., reprojection_error_px: _Optional[float] = ..., position_offset_m: _Optional[float] = ..., rotation_offset_deg: _Optional[float] = ..., focal_ratio: _Optional[float] = ..., other: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ...) -> None: ...
+
+class GetSceneReportRequest(_message.Message):
+    __slots__ = ("scene", "first_day", "last_day", "days_per_period")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    FIRST_DAY_FIELD_NUMBER: _ClassVar[int]
+    LAST_DAY_FIELD_NUMBER: _ClassVar[int]
+    DAYS_PER_PERIOD_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    first_day: str
+    last_day: str
+    days_per_period: int
+    def __init__(self, scene: _Optional[str] = ..., first_day: _Optional[str] = ..., last_day: _Optional[str] = ..., days_per_period: _Optional[int] = ...) -> None: ...
+
+class GetSceneReportResponse(_message.Message):
+    __slots__ = ("report",)
+    REPORT_FIELD_NUMBER: _ClassVar[int]
+    report: SceneReport
+    def __init__(self, report: _Optional[_Union[SceneReport, _Mapping]] = ...) -> None: ...
+
+class SceneReport(_message.Message):
+    __slots__ = ("scene", "first_day", "last_day", "periods", "places", "omitted_place_count", "suggestions", "events", "arbitrary_unit")
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    FIRST_DAY_FIELD_NUMBER: _ClassVar[int]
+    LAST_DAY_FIELD_NUMBER: _ClassVar[int]
+    PERIODS_FIELD_NUMBER: _ClassVar[int]
+    PLACES_FIELD_NUMBER: _ClassVar[int]
+    OMITTED_PLACE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    SUGGESTIONS_FIELD_NUMBER: _ClassVar[int]
+    EVENTS_FIELD_NUMBER: _ClassVar[int]
+    ARBITRARY_UNIT_FIELD_NUMBER: _ClassVar[int]
+    scene: str
+    first_day: str
+    last_day: str
+    periods: _containers.RepeatedCompositeFieldContainer[PeriodCounts]
+    places: _containers.RepeatedCompositeFieldContainer[PlaceReport]
+    omitted_place_count: int
+    suggestions: _containers.RepeatedCompositeFieldContainer[ReferenceSuggestion]
+    events: _containers.RepeatedCompositeFieldContainer[ReferenceEvent]
+    arbitrary_unit: bool
+    def __init__(self, scene: _Optional[str] = ..., first_day: _Optional[str] = ..., last_day: _Optional[str] = ..., periods: _Optional[_Iterable[_Union[PeriodCounts, _Mapping]]] = ..., places: _Optional[_Iterable[_Union[PlaceReport, _Mapping]]] = ..., omitted_place_count: _Optional[int] = ..., suggestions: _Optional[_Iterable[_Union[ReferenceSuggestion, _Mapping]]] = ..., events: _Optional[_Iterable[_Union[ReferenceEvent, _Mapping]]] = ..., arbitrary_unit: bool = ...) -> None: ...
+
+class PeriodCounts(_message.Message):
+    __slots__ = ("first_day", "last_day", "localized_count", "rejections", "surveyed_share", "position_68_m", "inlier_count")
+    FIRST_DAY_FIELD_NUMBER: _ClassVar[int]
+    LAST_DAY_FIELD_NUMBER: _ClassVar[int]
+    LOCALIZED_COUNT_FIELD_NUMBER: _ClassVar[int]
+    REJECTIONS_FIELD_NUMBER: _ClassVar[int]
+    SURVEYED_SHARE_FIELD_NUMBER: _ClassVar[int]
+    POSITION_68_M_FIELD_NUMBER: _ClassVar[int]
+    INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    first_day: str
+    last_day: str
+    localized_count: int
+    rejections: _containers.RepeatedCompositeFieldContainer[RejectionCount]
+    surveyed_share: float
+    position_68_m: float
+    inlier_count: float
+    def __init__(self, first_day: _Optional[str] = ..., last_day: _Optional[str] = ..., localized_count: _Optional[int] = ..., rejections: _Optional[_Iterable[_Union[RejectionCount, _Mapping]]] = ..., surveyed_share: _Optional[float] = ..., position_68_m: _Optional[float] = ..., inlier_count: _Optional[float] = ...) -> None: ...
+
+class RejectionCount(_message.Message):
+    __slots__ = ("reason", "count")
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    reason: _localization_service_pb2.RejectionReason
+    count: int
+    def __init__(self, reason: _Optional[_Union[_localization_service_pb2.RejectionReason, str]] = ..., count: _Optional[int] = ...) -> None: ...
+
+class PlaceReport(_message.Message):
+    __slots__ = ("reference", "world_from_camera", "periods", "state", "is_outdated", "adopted_count", "retired_count", "rejected_position")
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    WORLD_FROM_CAMERA_FIELD_NUMBER: _ClassVar[int]
+    PERIODS_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    IS_OUTDATED_FIELD_NUMBER: _ClassVar[int]
+    ADOPTED_COUNT_FIELD_NUMBER: _ClassVar[int]
+    RETIRED_COUNT_FIELD_NUMBER: _ClassVar[int]
+    REJECTED_POSITION_FIELD_NUMBER: _ClassVar[int]
+    reference: str
+    world_from_camera: _geometry_pb2.RigidTransform
+    periods: _containers.RepeatedCompositeFieldContainer[PeriodCounts]
+    state: PlaceState
+    is_outdated: bool
+    adopted_count: int
+    retired_count: int
+    rejected_position: RejectedPosition
+    def __init__(self, reference: _Optional[str] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., periods: _Optional[_Iterable[_Union[PeriodCounts, _Mapping]]] = ..., state: _Optional[_Union[PlaceState, _Mapping]] = ..., is_outdated: bool = ..., adopted_count: _Optional[int] = ..., retired_count: _Optional[int] = ..., rejected_position: _Optional[_Union[RejectedPosition, _Mapping]] = ...) -> None: ...
+
+class RejectedPosition(_message.Message):
+    __slots__ = ("photograph_count", "position", "forward", "spread_m")
+    PHOTOGRAPH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    FORWARD_FIELD_NUMBER: _ClassVar[int]
+    SPREAD_M_FIELD_NUMBER: _ClassVar[int]
+    photograph_count: int
+    position: _geometry_pb2.Vector3
+    forward: _geometry_pb2.Vector3
+    spread_m: float
+    def __init__(self, photograph_count: _Optional[int] = ..., position: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., forward: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., spread_m: _Optional[float] = ...) -> None: ...
+
+class ReferenceSuggestion(_message.Message):
+    __slots__ = ("place", "photograph_count", "position", "forward", "distance_m", "message")
+    PLACE_FIELD_NUMBER: _ClassVar[int]
+    PHOTOGRAPH_COUNT_FIELD_NUMBER: _ClassVar[int]
+    POSITION_FIELD_NUMBER: _ClassVar[int]
+    FORWARD_FIELD_NUMBER: _ClassVar[int]
+    DISTANCE_M_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    place: str
+    photograph_count: float
+    position: _geometry_pb2.Vector3
+    forward: _geometry_pb2.Vector3
+    distance_m: float
+    message: str
+    def __init__(self, place: _Optional[str] = ..., photograph_count: _Optional[float] = ..., position: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., forward: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., distance_m: _Optional[float] = ..., message: _Optional[str] = ...) -> None: ...
+
+class ReferenceEvent(_message.Message):
+    __slots__ = ("reference", "time", "kind", "message", "place")
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    TIME_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    MESSAGE_FIELD_NUMBER: _ClassVar[int]
+    PLACE_FIELD_NUMBER: _ClassVar[int]
+    reference: str
+    time: _timestamp_pb2.Timestamp
+    kind: ReferenceEventKind
+    message: str
+    place: str
+    def __init__(self, reference: _Optional[str] = ..., time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., kind: _Optional[_Union[ReferenceEventKind, str]] = ..., message: _Optional[str] = ..., place: _Optional[str] = ...) -> None: ...
 
 class CheckCoverageRequest(_message.Message):
     __slots__ = ("scene", "world_from_camera", "intrinsics")

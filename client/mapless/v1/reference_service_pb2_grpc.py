@@ -121,6 +121,11 @@ class ReferenceServiceStub(object):
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.AuditSceneRequest.SerializeToString,
                 response_deserializer=mapless_dot_v1_dot_reference__service__pb2.AuditSceneResponse.FromString,
                 _registered_method=True)
+        self.GetSceneReport = channel.unary_unary(
+                '/mapless.v1.ReferenceService/GetSceneReport',
+                request_serializer=mapless_dot_v1_dot_reference__service__pb2.GetSceneReportRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_reference__service__pb2.GetSceneReportResponse.FromString,
+                _registered_method=True)
         self.CheckCoverage = channel.unary_unary(
                 '/mapless.v1.ReferenceService/CheckCoverage',
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.CheckCoverageRequest.SerializeToString,
@@ -250,6 +255,15 @@ class ReferenceServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def GetSceneReport(self, request, context):
+        """Reports how photographs of a scene were answered: localized or rejected, by day, place and reason, and where further
+        references would help most. Counts alone are kept, for as many days as the server is set to; confidential requests are
+        not counted. What was answered in the last seconds may be missing.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def CheckCoverage(self, request, context):
         """Predicts whether a photograph at a pose would be localized, without one. Takes the role localize.
         """
@@ -324,6 +338,11 @@ def add_ReferenceServiceServicer_to_server(servicer, server):
                     servicer.AuditScene,
                     request_deserializer=mapless_dot_v1_dot_reference__service__pb2.AuditSceneRequest.FromString,
                     response_serializer=mapless_dot_v1_dot_reference__service__pb2.AuditSceneResponse.SerializeToString,
+            ),
+            'GetSceneReport': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetSceneReport,
+                    request_deserializer=mapless_dot_v1_dot_reference__service__pb2.GetSceneReportRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_reference__service__pb2.GetSceneReportResponse.SerializeToString,
             ),
             'CheckCoverage': grpc.unary_unary_rpc_method_handler(
                     servicer.CheckCoverage,
@@ -704,6 +723,33 @@ class ReferenceService(object):
             '/mapless.v1.ReferenceService/AuditScene',
             mapless_dot_v1_dot_reference__service__pb2.AuditSceneRequest.SerializeToString,
             mapless_dot_v1_dot_reference__service__pb2.AuditSceneResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetSceneReport(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.ReferenceService/GetSceneReport',
+            mapless_dot_v1_dot_reference__service__pb2.GetSceneReportRequest.SerializeToString,
+            mapless_dot_v1_dot_reference__service__pb2.GetSceneReportResponse.FromString,
             options,
             channel_credentials,
             insecure,

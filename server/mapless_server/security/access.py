@@ -196,6 +196,7 @@ METHOD_ROLES: Mapping[str, Role] = {
     "/mapless.v1.ReferenceService/RestoreReference": Role.WRITE,
     "/mapless.v1.ReferenceService/RetrieveReferences": Role.LOCALIZE,
     "/mapless.v1.ReferenceService/AuditScene": Role.WRITE,
+    "/mapless.v1.ReferenceService/GetSceneReport": Role.READ,
     "/mapless.v1.ReferenceService/CheckCoverage": Role.LOCALIZE,
 }
 """The least role that a caller of the method must have."""

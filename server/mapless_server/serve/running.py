@@ -272,8 +272,13 @@ async def _start(
     _run_task(stack, stop_serving())
     services.starts("it localizes its first photograph")
     await _warm_up(settings, engine, metrics)
+    from .counting import Counting  # what it imports is loaded by now
+
     adopter = adopting(engine, store, metrics, settings.capture_hours)
-    await services.open(engine, adopter.offer)
+    counting = Counting(engine, store, metrics, settings.report_days)
+    stack.push_async_callback(counting.close)
+    _run_task(stack, counting.run())
+    await services.open(engine, adopter.offer, counting.note)
     _run_task(stack, adopter.run())
     from .idle import release_when_idle  # what it imports is loaded by now
 

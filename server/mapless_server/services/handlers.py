@@ -26,7 +26,7 @@ from mapless_server.settings import Settings
 from mapless_server.store import Store
 
 from .capture.recorder import Recorder
-from .localization import LocalizationService, Offer
+from .localization import Count, LocalizationService, Offer
 from .references import ReferenceService
 from .watching import Watchers
 
@@ -53,7 +53,7 @@ _NEEDS_ROOM = {
 _LEAST_S = 0.002
 """Such a method takes longer, however small its photographs: with less time left its message is not read."""
 
-_OF_STORE_ALONE = ("CreateScene", "ListScenes", "UpdateScene", "GetReference", "ListReferences")
+_OF_STORE_ALONE = ("CreateScene", "ListScenes", "UpdateScene", "GetReference", "ListReferences", "GetSceneReport")
 _OF_STORE = frozenset(f"/{SERVICE_NAMES[1]}/{name}" for name in _OF_STORE_ALONE)
 """The methods that need the store alone: they are answered while the server starts."""
 
@@ -148,10 +148,13 @@ class Services:
         self._metrics.not_serving_because = f"starting: {step}"
         log.info("the server starts: %s", step)
 
-    async def open(self, engine: QueueEngine, offer: Offer | None = None) -> None:
-        """Starts to serve, with an engine that has been warmed up; `offer` receives answers to single photographs."""
+    async def open(self, engine: QueueEngine, offer: Offer | None = None, count: Count | None = None) -> None:
+        """Starts to serve, with an engine that has been warmed up.
+
+        `offer` receives answers to single photographs, `count` all photographs of answers that are not confidential.
+        """
         self._engine = engine
-        self._localization.offer = offer
+        self._localization.offer, self._localization.count = offer, count
         await self.set_serving(True)
 
     async def drain(self, delay_s: float, grace_s: float) -> None:

@@ -61,6 +61,9 @@ GiveBetter = Callable[[pb.LocalizeResponse], None]
 Offer = Callable[[pb.LocalizeRequest, pb.LocalizeResponse, Query, Result, Principal], None]
 """Receives a request, its answer and its caller, which may become a reference; must return at once."""
 
+Count = Callable[[Sequence[tuple[Query, Result]], Any, Any], None]
+"""Receives answered photographs, the outcome of their call and the message of its pose, to be counted; at once."""
+
 
 class LocalizationService(rpcs.LocalizationServiceServicer):
     """Localizes photographs: single ones, rigs and sequences."""
@@ -87,6 +90,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._recorder = recorder
         self.offer: Offer | None = None
         """Receives each answer to a single photograph, once it is made; None before the server serves."""
+        self.count: Count | None = None
+        """Receives the photographs of each answer that is not confidential; None where they are not counted."""
 
     async def Localize(self, request: pb.LocalizeRequest, call: Call) -> pb.LocalizeResponse:
         """Implements LocalizationService.Localize."""
@@ -188,6 +193,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._capture(request, response, call, [(query, result)], prior_attributes)
         if not request.options.confidential:
             self._watchers.publish(result.scene_key, request, response, debug)
+        self._count_photographs(request, [(query, result)], answer.outcome, response.localization)
         if self.offer is not None:
             self.offer(request, response, query, result, call.principal)
         return response
@@ -302,7 +308,15 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             report.diagnostics.request_id = call.request_id
         call.note(localized_alone=sum(not report.HasField("alone") for report in response.images))
         self._report(outcome, response.localization, results, call)
-        self._capture(request, response, call, list(zip(queries, results, strict=True)))
+        parts = list(zip(queries, results, strict=True))
+        self._capture(request, response, call, parts)
+        self._count_photographs(request, parts, outcome, response.localization)
+
+    def _count_photographs(
+        self, request: Request, parts: Sequence[tuple[Query, Result]], outcome: object, localization: Any
+    ) -> None:
+        if self.count is not None and not request.options.confidential:
+            self.count(parts, outcome, localization)
 
     def _report(
         self,

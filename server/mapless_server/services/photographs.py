@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 from mapless_server.engine.groups import GroupResult, PhotoGroup, after_rejection
-from mapless_server.engine.query import Query, Result
+from mapless_server.engine.query import Query, Result, SceneQuestion
 from mapless_server.errors import RequestError
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.rejection import Rejection
@@ -165,9 +165,11 @@ def common_scene(results: Sequence[Result]) -> SceneKey | Rejection | None:
 
 def in_scene(query: Query, scene_key: SceneKey) -> Query:
     """The query of a photograph in one of its scenes; its priors count there also where they left that scene out."""
-    scenes = query.scenes
+    return replace(query.in_scene(question_in(query.scenes, scene_key)), scenes=(), prior_scene=None)
+
+
+def question_in(scenes: Sequence[SceneQuestion], scene_key: SceneKey) -> SceneQuestion:
+    """The question of one of several scenes, as if it were named."""
     if isinstance(scenes, SceneQuestions):
-        question = scenes.of_scene(scene_key)
-    else:
-        question = next(it for it in scenes if it.scene_key == scene_key)
-    return replace(query.in_scene(question), scenes=(), prior_scene=None)
+        return scenes.of_scene(scene_key)
+    return next(it for it in scenes if it.scene_key == scene_key)

@@ -56,6 +56,7 @@ from .messages.references import (
     scene_to_message,
 )
 from .reach import Reach, check_stays_in_reach
+from .reports import scene_report
 
 if TYPE_CHECKING:  # services do not load what computes
     from mapless.scenes import AdoptionPolicy
@@ -331,6 +332,11 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         page = Page(request, call.principal.tenant, f"{request.scene} audit", DEFAULT_AUDITS, MAX_AUDITS)
         found = await self._stored(self._store.list_reference_ids, scene_key, page.limit, page.after)
         return page.cut(found, lambda reference_id: reference_id)
+
+    async def GetSceneReport(self, request: pb.GetSceneReportRequest, call: Call) -> pb.GetSceneReportResponse:
+        """Implements ReferenceService.GetSceneReport."""
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
+        return pb.GetSceneReportResponse(report=await self._stored(scene_report, self._store, scene_key, request))
 
     async def CheckCoverage(self, request: pb.CheckCoverageRequest, call: Call) -> pb.CheckCoverageResponse:
         """Implements ReferenceService.CheckCoverage."""

@@ -319,6 +319,13 @@ def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> 
     return connection.execute(addition, execution_options={"preserve_rowcount": True}).rowcount == 1
 
 
+def add_to(connection: Connection, table: Table, row: Mapping[str, Any], summed: Collection[str]) -> None:
+    """Adds a row's values of the `summed` columns to the row with its primary key, or inserts it if there is none."""
+    addition = _upsert(connection, table).values(row)
+    sums = {name: table.c[name] + addition.excluded[name] for name in summed}
+    connection.execute(addition.on_conflict_do_update(index_elements=list(table.primary_key), set_=sums))
+
+
 def reference_not_found(scene_key: SceneKey, reference_id: str, field: str) -> NotFound:
     """The error for a reference that does not exist."""
     scene_id = scene_id_of(scene_key)

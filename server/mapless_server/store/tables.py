@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 14
+SCHEMA_VERSION = 15
 
 metadata = MetaData()
 
@@ -206,4 +206,31 @@ scene_calibration = Table(
     Column("failure_count", Integer, nullable=False, server_default=_NONE_YET),
     Column("data", LargeBinary),  # see codec.py
     Column("sha256", _Sha256),
+)
+
+# Answered photographs by scene, day, place and outcome, with sums, see counts.py; no photographs, no callers.
+scene_count = Table(
+    "scene_count",
+    metadata,
+    Column("scene_id", _SceneKey, ForeignKey("scene.scene_id", ondelete="CASCADE"), primary_key=True),
+    Column("day", Integer, primary_key=True, autoincrement=False),  # since 1970, UTC
+    # Of a surveyed reference, which may have been deleted since; empty if unknown.
+    Column("place_key", _Key, primary_key=True),
+    Column("outcome", String(32), primary_key=True),
+    Column("photograph_count", BigInteger, nullable=False),
+    Column("surveyed_share", Double, nullable=False),
+    Column("inlier_count", BigInteger, nullable=False),
+    Column("radius_count", BigInteger, nullable=False),  # photographs with a radius
+    Column("log_radius", Double, nullable=False),
+    Column("position_count", BigInteger, nullable=False),  # photographs with a position
+    # From the place's reference, world axes, and squared.
+    Column("offset_x", Double, nullable=False),
+    Column("offset_y", Double, nullable=False),
+    Column("offset_z", Double, nullable=False),
+    Column("squared_offset", Double, nullable=False),
+    # Viewing directions of those whose is known.
+    Column("forward_x", Double, nullable=False),
+    Column("forward_y", Double, nullable=False),
+    Column("forward_z", Double, nullable=False),
+    Index("scene_count_by_day", "day"),
 )

@@ -185,8 +185,13 @@ def nearest_viewpoint(centres: Array, axes: Array, pose: RigidTransform) -> int:
 
     Centres (N, 3) and unit axes (N, 3) are in the world; at least one.
     """
-    distance = np.linalg.norm(centres - pose.translation, axis=1)
-    looks = axes @ pose.rotation[:, 2] > 0.5
+    return nearest_place(centres, axes, pose.translation, pose.rotation[:, 2])
+
+
+def nearest_place(centres: Array, axes: Array, position: Array, forward: Array | None) -> int:
+    """The same for a position (3,) and a direction (3,) of unit length; where that is not known, of all references."""
+    distance = np.linalg.norm(centres - position, axis=1)
+    looks = np.zeros(len(axes), bool) if forward is None else axes @ forward > 0.5
     return int(np.where(looks, distance, np.inf).argmin() if looks.any() else distance.argmin())
 
 

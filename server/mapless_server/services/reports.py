@@ -1,0 +1,207 @@
+"""Reports of scenes: reads what the store has counted, and makes the message; loads what computes when it is called."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from datetime import date, datetime, timedelta, timezone
+from typing import TYPE_CHECKING
+
+from mapless import names
+from mapless.geometry import Array
+from mapless.v1 import geometry_pb2
+from mapless.v1 import localization_service_pb2 as localization_pb
+from mapless.v1 import reference_service_pb2 as pb
+from mapless.wire import FieldError
+from mapless_server.security import SceneKey, scene_id_of
+from mapless_server.store import ReferenceRecord, Retirement, RetirementReason, SceneRecord, Store
+
+from .messages.enums import enum_to_message
+from .messages.references import reference_to_message, retirement_of
+
+if TYPE_CHECKING:  # services do not load what computes
+    from mapless_server.scenes.report.summary import Cluster, Period, Suggestion
+    from mapless_server.store.counts import Event
+
+MOST_PLACES, MOST_EVENTS = 1000, 1000
+DEFAULT_PERIOD_DAYS, DEFAULT_PERIODS = 7, 4
+MOST_PERIOD_DAYS, MOST_DAYS = 366, 4000
+EPOCH = date(1970, 1, 1)
+
+
+def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRequest) -> pb.SceneReport:
+    """The report that a request asks for; FieldError names a wrong day, NotFound if there is no such scene."""
+    from mapless_server.scenes.report.summary import Cluster, by_place, periods_of, suggestions
+    from mapless_server.store.counts import find_references, read_report
+
+    first, last, days = days_from_message(request, datetime.now(timezone.utc).date())
+    scene, scene_id = store.get_scene(scene_key), scene_id_of(scene_key)
+    stored = read_report(store.database, scene_key, first, last, MOST_EVENTS)
+    keys = {it.place_key for it in stored.counts} | {it.place_key for it in stored.events}
+    records = find_references(store.database, scene_key, keys)
+    places = by_place(stored.counts, records)
+    outdated = {key: _is_outdated(scene, record) for key, record in records.items()}
+    periods = periods_of(stored.counts, first, last, days)
+    message = pb.SceneReport(
+        scene=names.scene_name(scene_id),
+        first_day=period_to_message(periods[0]).first_day,
+        last_day=period_to_message(periods[-1]).last_day,
+        periods=map(period_to_message, periods),
+        omitted_place_count=max(0, len(places) - MOST_PLACES),
+        arbitrary_unit=scene.attributes.arbitrary_unit,
+    )
+    for key, counts in list(places.items())[:MOST_PLACES]:
+        record = records.get(key)
+        its = place_to_message(
+            record,
+            periods_of(counts, first, last, days),
+            None if record is None else Cluster.of_rejected(counts, record.world_from_camera),
+            is_outdated=outdated.get(key, False),
+            adopted=stored.adopted.get(key, (0, 0)),
+        )
+        message.places.append(its)
+    poses = {key: record.world_from_camera for key, record in records.items()}
+    for it in suggestions(places, poses, last):
+        at, unit = records[it.place_key], scene.attributes.unit
+        message.suggestions.append(suggestion_to_message(it, at, unit, outdated[it.place_key]))
+    ids = {key: record.reference_id for key, record in records.items()}
+    message.events.extend(event_to_message(it, scene_id, ids) for it in reversed(stored.events))
+    return message
+
+
+def _is_outdated(scene: SceneRecord, place: ReferenceRecord) -> bool:
+    from mapless_server.scenes.adoption.policy import AdoptionOptions, is_outdated
+
+    policy, standing = scene.attributes.adoption, place.standing
+    return policy is not None and standing is not None and is_outdated(standing, policy, AdoptionOptions())
+
+
+def days_from_message(request: pb.GetSceneReportRequest, today: date) -> tuple[int, int, int]:
+    """First and last day, since 1970, UTC, and the days of a period; FieldError names a wrong one."""
+    if not 0 <= request.days_per_period <= MOST_PERIOD_DAYS:
+        raise FieldError("days_per_period", f"must be 0 to {MOST_PERIOD_DAYS}, is {request.days_per_period}")
+    period = request.days_per_period or DEFAULT_PERIOD_DAYS
+    last = _day(request.last_day, "last_day") if request.last_day else (today - EPOCH).days
+    first = _day(request.first_day, "first_day") if request.first_day else last - DEFAULT_PERIODS * period + 1
+    if first > last:
+        raise FieldError("first_day", f"must not be after last_day, {_text(last)}, is {_text(first)}")
+    if last - first >= MOST_DAYS:
+        raise FieldError("first_day", f"must be less than {MOST_DAYS} days before last_day, is {last - first}")
+    return first, last, period
+
+
+def _day(text: str, field: str) -> int:
+    with suppress(ValueError):
+        day = date.fromisoformat(text)
+        if day.isoformat() == text:  # Python reads other forms, too
+            return (day - EPOCH).days
+    raise FieldError(field, f"must be a day such as 2026-11-02, is {names.shown(text)}")
+
+
+def _text(day: int) -> str:
+    return (EPOCH + timedelta(days=day)).isoformat()
+
+
+def period_to_message(period: Period) -> pb.PeriodCounts:
+    """Message of the counts of some days."""
+    surveyed_share, radius_m, inlier_count = period.means
+    return pb.PeriodCounts(
+        first_day=_text(period.first_day),
+        last_day=_text(period.last_day),
+        localized_count=period.localized.photograph_count,
+        rejections=[
+            pb.RejectionCount(reason=enum_to_message(reason, localization_pb.RejectionReason), count=count)
+            for reason, count in period.rejections
+        ],
+        surveyed_share=surveyed_share,
+        position_68_m=radius_m,
+        inlier_count=inlier_count,
+    )
+
+
+def place_to_message(
+    record: ReferenceRecord | None,
+    periods: list[Period],
+    cluster: Cluster | None,
+    *,
+    is_outdated: bool,
+    adopted: tuple[int, int],
+) -> pb.PlaceReport:
+    """Message of how photographs of a place were answered; None for those whose place is not known.
+
+    `cluster` is where rejected ones were taken; `adopted` are the numbers of references in use and retired ones.
+    """
+    counted = [it for it in periods if it.of_outcome]
+    message = pb.PlaceReport(periods=map(period_to_message, counted), is_outdated=is_outdated)
+    if record is None:
+        return message
+    reference = reference_to_message(record)
+    message.reference = reference.name
+    message.world_from_camera.CopyFrom(reference.world_from_camera)
+    message.adopted_count, message.retired_count = adopted
+    if reference.HasField("place"):
+        message.state.CopyFrom(reference.place)
+    if cluster is not None:
+        message.rejected_position.photograph_count = round(cluster.count)
+        message.rejected_position.position.CopyFrom(_vector(cluster.position))
+        message.rejected_position.spread_m = cluster.spread_m
+        if cluster.forward is not None:
+            message.rejected_position.forward.CopyFrom(_vector(cluster.forward))
+    return message
+
+
+def _vector(vector: Array) -> geometry_pb2.Vector3:
+    x, y, z = vector.tolist()
+    return geometry_pb2.Vector3(x=x, y=y, z=z)
+
+
+def suggestion_to_message(
+    it: Suggestion, record: ReferenceRecord, unit: str, is_outdated: bool
+) -> pb.ReferenceSuggestion:
+    """Message of a suggestion for the place of a reference, in a scene with this unit of length."""
+    return pb.ReferenceSuggestion(
+        place=names.reference_name(record.scene_id, record.reference_id),
+        photograph_count=it.rescued_count,
+        position=_vector(it.position),
+        forward=_vector(it.forward),
+        distance_m=it.distance_m,
+        message=_sentence(it, record.reference_id, unit, is_outdated),
+    )
+
+
+_LACKING = {
+    "no_usable_references": "no reference can be used",
+    "degenerate_references": "the references stand at one position",
+    "low_overlap": "they do not connect to the references",
+    "scale_unreliable": "the references give no scale",
+    "too_few_matches": "too few matches have a point",
+    "pnp_failed": "no pose explains the matches",
+    "gate": "the evidence for a pose does not suffice",
+}
+"""Sentences about reasons that further references remedy."""
+
+
+def _sentence(it: Suggestion, reference_id: str, unit: str, is_outdated: bool) -> str:
+    x, y, z = it.position.tolist()
+    many = f"{it.rejected_count} of {it.photograph_count} photographs around {reference_id} were rejected"
+    why = f"most often because {_LACKING[it.reason.value]}"
+    if is_outdated:
+        return f"{many}, {why}; the place has changed: survey it again"
+    if it.positioned_share < 0.5:
+        return f"{many}, {why}; no prior says where they were taken: add references of what is seen from there"
+    where = f"on average at ({x:.2f}, {y:.2f}, {z:.2f}), {it.distance_m:.2g} {unit} from {reference_id}"
+    return f"{many}, {why}, {where}: add references there"
+
+
+def event_to_message(event: Event, scene_id: str, places: Mapping[str, str]) -> pb.ReferenceEvent:
+    """Message of a reference that was adopted or retired; places are ids by key."""
+    time = datetime.fromtimestamp(event.time_us // 1_000_000, timezone.utc)
+    place_id, retired = places.get(event.place_key, ""), event.retirement_reason
+    message = pb.ReferenceEvent(
+        reference=names.reference_name(scene_id, event.reference_id),
+        kind=pb.REFERENCE_EVENT_KIND_RETIRED if retired else pb.REFERENCE_EVENT_KIND_ADOPTED,
+        message=retirement_of(Retirement(time, RetirementReason(retired))) if retired else "",
+        place=names.reference_name(scene_id, place_id) if place_id else "",
+    )
+    message.time.FromDatetime(time)
+    return message

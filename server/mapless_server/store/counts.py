@@ -1,0 +1,187 @@
+"""Counts of answered photographs by scene, day, place and outcome, for reports of scenes; and the rows of a report.
+
+Only sums are kept: no photographs, no callers. Servers that share a store add up. A row is deleted when its day is too
+old, and with its scene; its place is the key of a surveyed reference, which may have been deleted since.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+from sqlalchemy import Select, delete, select
+
+from mapless_server.errors import DataLoss
+from mapless_server.security import SceneKey
+
+from . import queries, rows
+from .database import Database
+from .records import ReferenceRecord
+from .tables import adopted_reference, reference, reference_standing, scene, scene_count
+
+DAY_US = 24 * 3600 * 1_000_000
+LOCALIZED = "localized"
+"""The outcome of a photograph that was localized; others are values of `RejectionReason`."""
+
+
+class CountKey(NamedTuple):
+    """What photographs of a scene are counted by: the day since 1970, UTC, the place, empty if unknown, the outcome."""
+
+    day: int
+    place_key: str
+    outcome: str
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over photographs.
+
+    Attributes:
+        photograph_count: number of photographs.
+        surveyed_share: of localized ones, shares of their matches that surveyed references have.
+        inlier_count: of localized ones, matches that agree with their pose.
+        radius_count, log_radius: photographs with a 68 % radius, and its natural logarithms, metres.
+        position_count: rejected photographs whose position is known.
+        offset_x, offset_y, offset_z: their offsets from the place's reference, world axes, metres.
+        squared_offset: squares of the lengths of these offsets.
+        forward_x, forward_y, forward_z: viewing directions, world, of those of them whose direction is known.
+    """
+
+    photograph_count: int = 0
+    surveyed_share: float = 0.0
+    inlier_count: int = 0
+    radius_count: int = 0
+    log_radius: float = 0.0
+    position_count: int = 0
+    offset_x: float = 0.0
+    offset_y: float = 0.0
+    offset_z: float = 0.0
+    squared_offset: float = 0.0
+    forward_x: float = 0.0
+    forward_y: float = 0.0
+    forward_z: float = 0.0
+
+    def __add__(self, other: Sums) -> Sums:
+        return Sums(**{name: getattr(self, name) + getattr(other, name) for name in _NAMES})
+
+    def times(self, weight: float) -> Sums:
+        """The sums with each photograph counted as so many."""
+        return Sums(**{name: weight * getattr(self, name) for name in _NAMES})
+
+
+_NAMES = tuple(it.name for it in fields(Sums))
+
+
+def scenes_created(database: Database, scene_keys: Collection[SceneKey]) -> dict[SceneKey, int]:
+    """When scenes were created, microseconds since 1970, by key; those that do not exist are left out."""
+    column, found = scene.c, dict[SceneKey, int]()
+    with database.read() as connection:
+        for some in queries.portions(sorted(scene_keys)):
+            created: Select[Any] = select(column.scene_id, column.create_time_us).where(column.scene_id.in_(some))
+            found |= {SceneKey(it.scene_id): it.create_time_us for it in connection.execute(created)}
+    return found
+
+
+def add_counts(database: Database, counted: Mapping[SceneKey, Mapping[CountKey, Sums]]) -> None:
+    """Adds to the counts of scenes, in one transaction; those that do not exist any more are passed over."""
+    with database.write() as connection:
+        for scene_key, counts in sorted(counted.items()):
+            # Its deletion waits for the end of the transaction.
+            there = select(scene.c.scene_id).where(scene.c.scene_id == scene_key)
+            if connection.scalar(there.with_for_update(read=True, key_share=True)) is None:
+                continue
+            for key, sums in sorted(counts.items()):
+                row = {"scene_id": scene_key, **key._asdict(), **vars(sums)}
+                queries.add_to(connection, scene_count, row, _NAMES)
+
+
+def delete_counts(database: Database, before_day: int) -> int:
+    """Deletes the counts of days before one; returns the number of rows."""
+    with database.write() as connection:
+        return connection.execute(delete(scene_count).where(scene_count.c.day < before_day)).rowcount
+
+
+class Event(NamedTuple):
+    """A reference that was adopted or, with a reason, retired."""
+
+    reference_id: str
+    time_us: int
+    retirement_reason: str | None
+    place_key: str
+
+
+@dataclass(frozen=True, eq=False)
+class StoredReport:
+    """What is stored of a scene's answers, read at one moment.
+
+    Attributes:
+        counts: by what they are counted by, in no order.
+        events: references that were adopted or retired, the last ones first.
+        adopted: for each place with adopted references, by key, how many are in use and how many are retired.
+    """
+
+    counts: Mapping[CountKey, Sums]
+    events: Sequence[Event]
+    adopted: Mapping[str, tuple[int, int]]
+
+
+def read_report(
+    database: Database, scene_key: SceneKey, first_day: int, last_day: int, most_events: int
+) -> StoredReport:
+    """Reads what is stored of a scene's answers; of one that does not exist nothing.
+
+    Args:
+        database: the database.
+        scene_key: the scene.
+        first_day: since 1970, UTC.
+        last_day: likewise.
+        most_events: the last so many events are read.
+    """
+    column, adopted, standing = scene_count.c, adopted_reference.c, reference_standing.c
+    counted = select(scene_count).where(column.scene_id == scene_key, column.day.between(first_day, last_day))
+    of_scene: Select[Any] = (
+        select(
+            reference.c.reference_id,
+            reference.c.key,
+            adopted.adopt_time_us,
+            adopted.place_key,
+            standing.retire_time_us,
+            standing.retire_reason,
+        )
+        .outerjoin(adopted_reference, adopted.reference_key == reference.c.key)
+        .outerjoin(reference_standing, standing.reference_key == reference.c.key)
+        .where(reference.c.scene_id == scene_key)
+        .where(adopted.adopt_time_us.is_not(None) | standing.retire_time_us.is_not(None))
+    )
+    with database.read() as connection:
+        counts = {
+            CountKey(it.day, it.place_key, it.outcome): Sums(**{name: getattr(it, name) for name in _NAMES})
+            for it in connection.execute(counted)
+        }
+        found = connection.execute(of_scene).all()
+    events, places = list[Event](), dict[str, tuple[int, int]]()
+    for it in found:
+        place_key = it.key if it.place_key is None else it.place_key
+        if it.adopt_time_us is not None:
+            events.append(Event(it.reference_id, it.adopt_time_us, None, place_key))
+        if it.retire_time_us is not None:
+            events.append(Event(it.reference_id, it.retire_time_us, it.retire_reason, place_key))
+        used, retired = places.get(place_key, (0, 0))
+        is_retired = it.retire_time_us is not None
+        places[place_key] = (used + (not is_retired), retired + is_retired)
+    events = [it for it in events if first_day <= it.time_us // DAY_US <= last_day]
+    events.sort(key=lambda it: (-it.time_us, it.reference_id))
+    return StoredReport(counts, events[:most_events], places)
+
+
+def find_references(database: Database, scene_key: SceneKey, keys: Collection[str]) -> dict[str, ReferenceRecord]:
+    """References of a scene by key, with what photographs said of them; those that are gone or damaged are left out."""
+    of_scene, found = queries.select_references().where(reference.c.scene_id == scene_key), dict[str, ReferenceRecord]()
+    with database.read() as connection:
+        for some in queries.portions(sorted(keys)):
+            for row in connection.execute(of_scene.where(reference.c.key.in_(some))):
+                with suppress(DataLoss):
+                    found[row.key] = rows.reference_record(row)
+    return found

@@ -1,0 +1,144 @@
+"""Reports of scenes: photographs become counts by place, and counts become suggestions; planted values."""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from mapless.geometry import Array, RigidTransform, rotation_from_vector
+from mapless_server.method.rejection import RejectionReason
+from mapless_server.scenes.report.counting import Places, Sighting, counted
+from mapless_server.scenes.report.summary import Cluster, by_place, periods_of, suggestions, total
+from mapless_server.scenes.retrieval.index import SceneIndex
+from mapless_server.store.counts import DAY_US, LOCALIZED, CountKey, Sums
+from mapless_server.store.records import Adopted, IndexedReference, SceneChanges
+
+DAY = 20_000
+LOW, GATE, DARK = (it.value for it in (RejectionReason.LOW_OVERLAP, RejectionReason.GATE, RejectionReason.LOW_TEXTURE))
+
+
+def at(x_m: float, turned_deg: float = 0.0) -> RigidTransform:
+    return RigidTransform(rotation_from_vector([0.0, np.radians(turned_deg), 0.0]), np.array([x_m, 0.0, 0.0]))
+
+
+POSES = {"a": at(0.0), "b": at(10.0), "adopted": at(9.0)}
+
+
+@pytest.fixture
+def places() -> Places:
+    """Two surveyed references, 10 m apart, and one that was adopted between them, at the place of b."""
+    index = SceneIndex(4)
+    added = tuple(IndexedReference(name, f"key-{name}", pose, None) for name, pose in POSES.items())
+    index.apply(SceneChanges(1, added, frozenset(), True))
+    return Places(index.entries(), [Adopted("adopted", "key-adopted", "key-b", 0.5, False)])
+
+
+def seen(outcome: str = LOW, position: Array | None = None, forward: Array | None = None, like: str = "") -> Sighting:
+    return Sighting(DAY * DAY_US + 5, outcome, position, forward, like)
+
+
+@pytest.mark.parametrize(
+    ("sighting", "place_key"),
+    [
+        (seen(position=np.array([4.0, 0.0, 0.0])), "key-a"),
+        (seen(position=np.array([8.9, 0.0, 0.0])), "key-b"),
+        (seen(position=np.array([4.0, 0.0, 0.0]), like="b"), "key-a"),
+        (seen(like="b"), "key-b"),
+        (seen(like="adopted"), "key-b"),
+        (seen(like="gone"), ""),
+        (seen(), ""),
+    ],
+)
+def test_a_photograph_counts_at_its_place(places: Places, sighting: Sighting, place_key: str) -> None:
+    (key,) = counted([sighting], places)
+    assert key == CountKey(DAY, place_key, LOW)
+
+
+def test_rejected_positions_are_summed_around_their_place(places: Places) -> None:
+    found = counted([seen(position=np.array([12.0, y, 0.0]), forward=np.array([0, 0, 1.0])) for y in (-1, 1)], places)
+    cluster = Cluster.of(found[CountKey(DAY, "key-b", LOW)], POSES["b"])
+    assert cluster is not None
+    np.testing.assert_allclose(cluster.position, [12.0, 0.0, 0.0])
+    assert cluster.spread_m == pytest.approx(1.0)
+    assert cluster.forward is not None
+    np.testing.assert_allclose(cluster.forward, [0.0, 0.0, 1.0])
+
+
+def test_the_surveyed_share_is_that_of_the_matches(places: Places) -> None:
+    pose = POSES["b"]
+    it = Sighting(5, LOCALIZED, pose.translation, pose.rotation[:, 2], "b", 80, 0.02, {"b": 60, "adopted": 20})
+    other = Sighting(5, LOCALIZED, pose.translation, pose.rotation[:, 2], "b", 40, 0.08, {"b": 40})
+    (found,) = periods_of(counted([it, other], places), 0, 0, 1)
+    assert found.means == pytest.approx((0.875, 0.04, 60.0))  # the geometric mean of the radii
+
+
+def test_a_scene_without_surveyed_references_has_no_places() -> None:
+    index = SceneIndex(4)
+    index.apply(SceneChanges(1, (), frozenset(), True))
+    found = counted([seen(position=np.zeros(3)), seen(like="a")], Places(index.entries(), []))
+    assert found == {CountKey(DAY, "", LOW): Sums(photograph_count=2)}
+
+
+def test_periods_end_with_the_last_day() -> None:
+    counts = {CountKey(DAY - age, "p", LOCALIZED): Sums(photograph_count=1 + age) for age in (0, 6, 7, 9)}
+    found = periods_of(counts, DAY - 9, DAY, 7)
+    assert [(it.first_day - DAY, it.last_day - DAY) for it in found] == [(-9, -7), (-6, 0)]
+    assert [it.localized.photograph_count for it in found] == [18, 8]
+
+
+def test_the_commonest_rejection_comes_first() -> None:
+    counts = {CountKey(DAY, "p", it): Sums(photograph_count=n) for it, n in ((LOW, 2), (GATE, 5), (LOCALIZED, 9))}
+    (period,) = periods_of(counts, DAY, DAY, 7)
+    assert period.rejections == [(RejectionReason.GATE, 5), (RejectionReason.LOW_OVERLAP, 2)]
+
+
+def at_place(key: str, outcomes: Iterable[tuple[int, str, int]]) -> dict[CountKey, Sums]:
+    return {CountKey(DAY - age, key, outcome): Sums(photograph_count=n) for age, outcome, n in outcomes}
+
+
+def test_the_place_that_lacks_references_is_suggested_first() -> None:
+    """What is localized nearly always needs none, bad photographs are not rescued, and old ones count less."""
+    planted = {
+        "corner": at_place("corner", [(0, LOW, 6), (1, GATE, 3), (0, LOCALIZED, 1)]),
+        "covered": at_place("covered", [(0, LOW, 12), (0, LOCALIZED, 400)]),
+        "dark": at_place("dark", [(0, DARK, 50)]),
+        "old": at_place("old", [(28, LOW, 20)]),
+        "unknown": at_place("unknown", [(0, LOW, 90)]),
+    }
+    poses = {name: at(i) for i, name in enumerate(planted) if name != "unknown"}
+    found = suggestions(planted, poses, DAY)
+    assert [it.place_key for it in found] == ["corner", "old"]
+    rejected = 6 + 3 * 2 ** (-1 / 14)
+    assert found[0].rescued_count == pytest.approx(rejected**2 / (rejected + 1))
+    assert found[1].rescued_count == pytest.approx(5.0)
+    assert (found[0].reason, found[0].rejected_count, found[0].photograph_count) == (RejectionReason.LOW_OVERLAP, 9, 10)
+
+
+def test_a_suggestion_is_where_photographs_were_taken() -> None:
+    sums = Sums(4, position_count=3, offset_x=9.0, squared_offset=27.0, forward_x=3.0)
+    (found,) = suggestions({"p": {CountKey(DAY, "p", LOW): sums}}, {"p": at(10.0)}, DAY)
+    np.testing.assert_allclose(found.position, [13.0, 0.0, 0.0])
+    np.testing.assert_allclose(found.forward, [1.0, 0.0, 0.0])
+    assert [found.distance_m, found.positioned_share] == pytest.approx([3.0, 0.75])
+
+
+def test_without_positions_it_is_where_the_reference_is() -> None:
+    (found,) = suggestions({"p": at_place("p", [(0, LOW, 4)])}, {"p": at(10.0, 90.0)}, DAY)
+    np.testing.assert_allclose(found.position, [10.0, 0.0, 0.0])
+    np.testing.assert_allclose(found.forward, [1.0, 0.0, 0.0], atol=1e-12)
+    assert found.distance_m == 0
+
+
+def test_directions_that_cancel_are_unknown() -> None:
+    cluster = Cluster.of(Sums(2, position_count=2), at(1.0))
+    assert cluster is not None
+    assert cluster.forward is None
+
+
+def test_counts_of_deleted_references_have_no_place() -> None:
+    planted = at_place("gone", [(0, LOW, 2)]) | at_place("", [(0, LOW, 3)]) | at_place("p", [(0, LOW, 1)])
+    found = by_place(planted, ["p"])
+    assert list(found) == ["", "p"]
+    assert total(found[""].values()).photograph_count == 5
+    assert math.isclose(sum(it.photograph_count for it in planted.values()), 6)

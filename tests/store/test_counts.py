@@ -1,0 +1,107 @@
+"""Counts of answered photographs, and what a report reads; on either database."""
+
+from dataclasses import replace
+from datetime import datetime, timezone
+
+from support.stores import Place, Shared, make_reference
+
+from mapless import Accuracy, AdoptionPolicy, Provenance, Voucher
+from mapless_server.security import SceneKey
+from mapless_server.store import RetirementReason, SceneAttributes, Store, adoption, counts
+from mapless_server.store.counts import LOCALIZED, CountKey, Sums
+
+HALL = SceneKey("hall")
+MONDAY = 20_000
+"""A day since 1970."""
+KEY = CountKey(MONDAY, "place", "low_overlap")
+ONE = Sums(photograph_count=1, position_count=1, offset_x=1.5, squared_offset=2.25, forward_z=1.0)
+
+
+def stored(store: Store, first_day: int = 0, last_day: int = 2 * MONDAY) -> dict[CountKey, Sums]:
+    return dict(counts.read_report(store.database, HALL, first_day, last_day, 9).counts)
+
+
+def test_counts_of_one_key_add_up(place: Place) -> None:
+    other = CountKey(MONDAY, "place", LOCALIZED)
+    with place.open() as store:
+        store.create_scene(HALL)
+        counts.add_counts(store.database, {HALL: {KEY: ONE}})
+        counts.add_counts(store.database, {HALL: {KEY: ONE.times(2), other: Sums(1, 0.5, 40, 1, -3.0)}})
+    with place.open() as store:
+        assert stored(store) == {KEY: ONE.times(3), other: Sums(1, 0.5, 40, 1, -3.0)}
+
+
+def test_counts_of_two_servers_add_up(shared: Shared) -> None:
+    with shared.open() as first, shared.open() as second:
+        first.create_scene(HALL)
+        for store in (first, second):
+            counts.add_counts(store.database, {HALL: {KEY: ONE}})
+        assert stored(first) == stored(second) == {KEY: ONE.times(2)}
+
+
+def test_a_deleted_scene_leaves_no_counts(place: Place) -> None:
+    with place.open() as store:
+        store.create_scene(HALL)
+        counts.add_counts(store.database, {HALL: {KEY: ONE}})
+        store.delete_scene(HALL)
+        counts.add_counts(store.database, {HALL: {KEY: ONE}})  # of a server that has not noticed
+        store.create_scene(HALL)
+        assert stored(store) == {}
+    assert place.fetch("SELECT COUNT(*) FROM scene_count") == [(0,)]
+
+
+def test_counting_is_no_change_of_the_scene(place: Place) -> None:
+    with place.open() as store:
+        before = store.create_scene(HALL).generation
+        counts.add_counts(store.database, {HALL: {KEY: ONE}})
+        assert store.get_generation(HALL) == before
+
+
+def test_counts_of_old_days_are_deleted(place: Place) -> None:
+    with place.open() as store:
+        store.create_scene(HALL)
+        counts.add_counts(store.database, {HALL: {KEY: ONE, KEY._replace(day=MONDAY + 1): ONE}})
+        assert counts.delete_counts(store.database, MONDAY + 1) == 1
+        assert [it.day for it in stored(store)] == [MONDAY + 1]
+
+
+def test_a_report_reads_its_days_alone(place: Place) -> None:
+    with place.open() as store:
+        store.create_scene(HALL)
+        counts.add_counts(store.database, {HALL: {KEY._replace(day=MONDAY + i): ONE for i in range(4)}})
+        assert sorted(it.day for it in stored(store, MONDAY + 1, MONDAY + 2)) == [MONDAY + 1, MONDAY + 2]
+
+
+def test_a_report_has_what_was_adopted_and_retired(place: Place) -> None:
+    today = int(datetime.now(timezone.utc).timestamp()) // 86400
+    with place.open() as store:
+        store.create_scene(HALL, SceneAttributes(adoption=AdoptionPolicy()))
+        keys = {it.reference_id: it.key for it in store.add_references(HALL, [make_reference(it) for it in "ab"])}
+        known = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("b", 40),))
+        new = [
+            adoption.adopt(store, HALL, replace(make_reference(it), provenance=known, place_key="place"), 9)[0]
+            for it in "xy"
+        ]
+        adoption.retire(store, HALL, [new[0].key], RetirementReason.VOUCHERS_GONE)
+        adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
+        found = counts.read_report(store.database, HALL, today, today + 1, 9)
+        assert [(it.reference_id, it.retirement_reason) for it in reversed(found.events)] == [
+            ("x", None),
+            ("y", None),
+            ("x", "vouchers_gone"),
+            ("a", "contradicted"),
+        ]
+        assert found.adopted == {"place": (1, 1), keys["a"]: (0, 1)}
+        assert counts.read_report(store.database, HALL, today - 9, today - 1, 9).events == []
+        assert counts.find_references(store.database, HALL, [keys["a"], "gone"]).keys() == {keys["a"]}
+
+
+def test_adding_to_many_scenes_is_one_transaction(place: Place) -> None:
+    with place.open() as store:
+        scenes = [SceneKey(f"s{i}") for i in range(3)]
+        for it in scenes:
+            store.create_scene(it)
+        store.add_references(scenes[0], [make_reference("a")])
+        counts.add_counts(store.database, {it: {KEY: ONE} for it in [*scenes, SceneKey("gone")]})
+        assert counts.scenes_created(store.database, [*scenes, SceneKey("gone")]).keys() == set(scenes)
+    assert place.fetch("SELECT COUNT(*) FROM scene_count") == [(3,)]
