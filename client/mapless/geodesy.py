@@ -179,11 +179,15 @@ class GeoPose:
 
 def ecef_from_geodetic(place: GeoPosition) -> Array:
     """A place in ECEF, (3,) metres."""
-    sin_lat, cos_lat = _sine_and_cosine(place.latitude_deg)
-    sin_lon, cos_lon = _sine_and_cosine(place.longitude_deg)
+    return _point_in_ecef(_sine_and_cosine(place.latitude_deg), _sine_and_cosine(place.longitude_deg), place.height_m)
+
+
+def _point_in_ecef(latitude: tuple[float, float], longitude: tuple[float, float], height_m: float) -> Array:
+    """The point (3,), metres, by the sines and cosines of the angles."""
+    (sin_lat, cos_lat), (sin_lon, cos_lon) = latitude, longitude
     normal_m = SEMI_MAJOR_M / math.sqrt(1 - _E2 * sin_lat**2)  # from the surface to the axis, along the normal
-    from_axis_m = (normal_m + place.height_m) * cos_lat
-    return np.array([from_axis_m * cos_lon, from_axis_m * sin_lon, (normal_m * (1 - _E2) + place.height_m) * sin_lat])
+    from_axis_m = (normal_m + height_m) * cos_lat
+    return np.array([from_axis_m * cos_lon, from_axis_m * sin_lon, (normal_m * (1 - _E2) + height_m) * sin_lat])
 
 
 def geodetic_from_ecef(x_in_ecef: ArrayLike) -> GeoPosition:
@@ -209,12 +213,17 @@ def geodetic_from_ecef(x_in_ecef: ArrayLike) -> GeoPosition:
 
 def ecef_from_enu_at(place: GeoPosition) -> RigidTransform:
     """The frame east, north, up at a place. At a pole the longitude defines east."""
-    sin_lat, cos_lat = _sine_and_cosine(place.latitude_deg)
-    sin_lon, cos_lon = _sine_and_cosine(place.longitude_deg)
-    east = (-sin_lon, cos_lon, 0.0)
-    north = (-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat)
-    up = (cos_lat * cos_lon, cos_lat * sin_lon, sin_lat)
-    return RigidTransform(np.column_stack([east, north, up]), ecef_from_geodetic(place))
+    latitude, longitude = _sine_and_cosine(place.latitude_deg), _sine_and_cosine(place.longitude_deg)
+    (sin_lat, cos_lat), (sin_lon, cos_lon) = latitude, longitude
+    # In columns: east, north, up.
+    rotation = np.array(
+        [
+            (-sin_lon, -sin_lat * cos_lon, cos_lat * cos_lon),
+            (cos_lon, -sin_lat * sin_lon, cos_lat * sin_lon),
+            (0.0, cos_lat, sin_lat),
+        ]
+    )
+    return RigidTransform(rotation, _point_in_ecef(latitude, longitude, place.height_m))
 
 
 def geodetic_from_world(x_in_world: ArrayLike, datum: Datum) -> GeoPosition:

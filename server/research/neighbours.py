@@ -160,7 +160,7 @@ def returning(tokens: int, calls: int = 4, seed: int = 0) -> tuple[float, float]
     return max(answers.seconds), len(answers.seconds) / (len(answers.seconds) + answers.failed)
 
 
-def next_client(busy: int, calls: int = 64) -> tuple[float, float]:
+def next_client(busy: int, calls: int = 24) -> tuple[float, float]:
     """Share of a client's calls that are answered beside busy clients of its token, and the share of time computed.
 
     It makes one call a second; each busy one makes so many at a time without end.

@@ -127,6 +127,7 @@ def test_a_wrong_position_costs_no_answer(client: Client) -> None:
     answer = found(client, group=SITE_A, priors=at_yard)
     assert (answer.scene, [it.conflict for it in answer.prior_checks]) == ("scenes/hall", [True])
     assert answer.diagnostics.searched_scene_count == 3
+    assert not {"decode", "features"} & set(answer.diagnostics.stage_s)  # known from the search before
     limited = PositionPrior(np.zeros(3), 20.0)
     refused = client.localize(PHOTO, CAMERA, group=SITE_A, prior_scene="yard", priors=Priors(position=limited))
     assert isinstance(refused, Rejected)

@@ -101,7 +101,7 @@ class Refusing:
     def __init__(self) -> None:
         self.jobs: list[weakref.ref[AnyJob]] = []
 
-    def query_job(self, query: Any, caller: Any, *, on_better: Any = None) -> AnyJob:
+    def query_job(self, query: Any, caller: Any, *, views: Any = None, on_better: Any = None) -> AnyJob:
         job: AnyJob = Job(Flow("", ""), Step("prepare", "", "", on_better), math.inf, 0)
         self.jobs.append(weakref.ref(job))
         return job

@@ -116,24 +116,28 @@ class QueueEngine:
         """Whether the queue has one job only, beside those that give way."""
         return self.queue.prompt_count == 1
 
+    def views_of(self, query: Query) -> QueryViews:
+        """The views of a query's photograph, for several jobs: it is decoded and described once for all of them."""
+        return QueryViews(query.photo, self.options.image_limits)
+
     def query_job(
         self,
         query: Query,
         caller: Caller,
         source: ReferenceSource | None = None,
         *,
+        views: QueryViews | None = None,
         on_better: Callable[[Result], None] | None = None,
         gives_way: bool = False,
     ) -> SearchJob:
         """Makes the job of localizing a photograph, for `run`; its `records` list the stages that it has been through.
 
-        `source` replaces the references, for the warm-up. `on_better` is called on the event loop, before the answer,
-        with each accepted answer that is better than the ones before while another attempt follows; and, if the query
-        allows it, with the coarse pose, which nothing has checked. The answer does not depend on it. A job that
-        `gives_way` is computed by threads of low priority.
+        `source` replaces the references, for the warm-up. `views` are those of an ended job of the photograph.
+        `on_better` is called on the event loop, before the answer, with each accepted answer that is better than the
+        ones before while another attempt follows; and, if the query allows it, with the coarse pose, which nothing has
+        checked. The answer does not depend on it. A job that `gives_way` is computed by threads of low priority.
         """
-        views = QueryViews(query.photo, self.options.image_limits)
-        search = Search.begin(query, source or self.references, views, caller.deadline_s)
+        search = Search.begin(query, source or self.references, views or self.views_of(query), caller.deadline_s)
         search = search.but(is_cut_at=lambda *_: self.queue.gets_cheap_steps(caller.flow))
         if on_better is not None:
             loop = asyncio.get_running_loop()

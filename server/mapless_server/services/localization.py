@@ -136,6 +136,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         engine, query, given_count = self._engine(), asked.query, 0
         # What the functions below use, not the jobs: these hold the photograph, and the functions.
         recorded: list[list[StageRecord]] = []
+        views = None if asked.beyond is None else engine.views_of(query)
 
         def to_message(result: Result) -> pb.LocalizeResponse:
             response = outcome_to_message(result, query.options, frames, query.photo)
@@ -164,7 +165,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             give(to_message(result))
 
         async def run(query: Query) -> Result:
-            job = engine.query_job(query, call.caller, on_better=None if give is None else give_better)
+            on_better = None if give is None else give_better
+            job = engine.query_job(query, call.caller, views=views, on_better=on_better)
             recorded.append(job.records)
             return await engine.run(job)
 
@@ -173,7 +175,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             if asked.beyond is not None and may_be_beyond(result):
                 query, result = await searched_beyond(query, result, asked.beyond, run)
         finally:
-            give = None  # a thread that has not noticed the end may still have a better one
+            give = views = None  # a thread that has not noticed the end may still have a better one
             for records in recorded:
                 call.record(records)
         response, answer = to_message(result), result.answer

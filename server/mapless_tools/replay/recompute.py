@@ -242,7 +242,9 @@ class _Recomputing:
         unrefined = Method(solve=_unrefined)
         self._method = unrefined if _is_cut_short(request, then) else Method()
 
-    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> SearchJob:
+    def query_job(
+        self, query: Query, caller: Caller, source: object = None, views: object = None, on_better: object = None
+    ) -> SearchJob:
         query, field = in_scene_of(query, self._call), query.photo.field
         extractor, part = self._tiers[0].extractor, self._parts[field]
         any_roll = next((it.features for it in self._tiers if it.any_roll), None)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mapless.geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, Datum, GeoPosition, world_from_enu_at, world_from_geodetic
+from mapless.geodesy import MAX_HEIGHT_M, MIN_HEIGHT_M, Datum, GeoPosition, world_from_enu_at
 from mapless.geometry import MAX_COORDINATE_M, Array
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as pb
@@ -112,9 +112,10 @@ def _geo_position(message: pb.GeoPositionPrior, attributes: SceneAttributes, fie
     if message.HasField("height_m"):
         height_m, vertical_sigma_m = message.height_m, message.vertical_sigma_m
     place = GeoPosition(message.latitude_deg, message.longitude_deg, height_m)
-    rotation = world_from_enu_at(place, datum).rotation
+    world_from_enu = world_from_enu_at(place, datum)
+    rotation = world_from_enu.rotation
     covariance = rotation @ _enu_covariance(message.horizontal_sigma_m, vertical_sigma_m) @ rotation.T
-    return PositionPrior(world_from_geodetic(place, datum), (covariance + covariance.T) / 2)
+    return PositionPrior(world_from_enu.translation, (covariance + covariance.T) / 2)
 
 
 def _enu_covariance(horizontal_sigma_m: float, vertical_sigma_m: float) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, overload
@@ -43,6 +43,11 @@ class FoundScenes:
     def questions(self) -> tuple[SceneQuestion, ...]:
         """The questions of a request without priors."""
         return tuple(SceneQuestion(it.scene_key, ANYWHERE, generation=it.generation) for it in self.scenes)
+
+    @cached_property
+    def indices(self) -> Mapping[SceneKey, int]:
+        """Where each scene stands among them."""
+        return {it.scene_key: i for i, it in enumerate(self.scenes)}
 
     @cached_property
     def attributes(self) -> tuple[SceneAttributes, ...]:
@@ -95,8 +100,8 @@ class SceneQuestions(Sequence[SceneQuestion]):
         return self._at(places) if isinstance(places, int) else [self._at(it) for it in places]
 
     def of_scene(self, scene_key: SceneKey) -> SceneQuestion:
-        """The question of one of the request's scenes as if it were named; ValueError if it is none of them."""
-        return self._priors.question([it.scene_key for it in self._priors.found.scenes].index(scene_key))
+        """The question of one of the request's scenes as if it were named; KeyError if it is none of them."""
+        return self._priors.question(self._priors.found.indices[scene_key])
 
     def _at(self, place: int) -> SceneQuestion:
         if place not in self._made:
@@ -202,7 +207,7 @@ def _prior_scene(
         given = in_world.ListFields()[0][0].name
         raise FieldError("prior_scene", f"is required with {given}: one of several scenes, in whose world it is given")
     key = scene_key_from_name(request.prior_scene, "prior_scene", tenant)
-    index = next((i for i, it in enumerate(found.scenes) if it.scene_key == key), None)
+    index = found.indices.get(key)
     if index is None:
         given = names.shown(request.prior_scene)
         raise FieldError("prior_scene", f"must be one of the request's scenes, {given} is not")
