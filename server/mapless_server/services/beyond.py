@@ -40,6 +40,6 @@ async def searched_beyond(
     except RequestError:
         return query, result
     count = result.searched_scene_count + found.searched_scene_count
-    is_there = isinstance(found.answer.outcome, Localization)
-    query, result = (further, found) if is_there else (query, result)
+    if isinstance(found.answer.outcome, Localization):
+        query, result = further, found
     return query, replace(result, searched_scene_count=count)

@@ -165,8 +165,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             give(to_message(result))
 
         async def run(query: Query) -> Result:
-            on_better = None if give is None else give_better
-            job = engine.query_job(query, call.caller, views=views, on_better=on_better)
+            job = engine.query_job(query, call.caller, views=views, on_better=None if give is None else give_better)
             recorded.append(job.records)
             return await engine.run(job)
 

@@ -73,7 +73,7 @@ async def in_common_scene(
     if isinstance(scene_key, Rejection):
         call.note(scene=groups[-1].results[-1].scene_key)
         return Ambiguous(GroupResult.of(groups), scene_key)
-    # In a thread: priors are converted to the scene's world, 0.1 ms for each photograph.
+    # In a thread, since converting priors takes 0.1 ms for each photograph.
     return await asyncio.to_thread(lambda: [in_scene(it, scene_key or queries[0].scene_key) for it in queries])
 
 

@@ -38,6 +38,14 @@ class Tracks:
         order = np.lexsort((view, point))
         return Tracks(point[order], view[order], keypoint[order])
 
+    def and_last(self, tracks: Tracks, count: int) -> Tracks:
+        """Appends tracks of further points, which follow the `count` points of these."""
+        return Tracks(
+            np.concatenate([self.point, count + tracks.point]),
+            np.concatenate([self.view, tracks.view]),
+            np.concatenate([self.keypoint, tracks.keypoint]),
+        )
+
     @property
     def point_count(self) -> int:
         """Number of points."""

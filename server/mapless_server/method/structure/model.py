@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array, Camera, RigidTransform, Similarity
 
-from ..features.tracks import Tracks
-
 if TYPE_CHECKING:  # services do not load what computes
+    from ..features.tracks import Tracks
     from ..features.views import Rows, View
     from .observations import KeypointNoise
 
@@ -164,7 +163,7 @@ class Structure:
         tracks, view = self.tracks, np.asarray(order, np.intp)[self.tracks.view]
         keypoint = view * (tracks.keypoint.max() + 1) + tracks.keypoint  # counted through all references
         points = np.argsort(np.minimum.reduceat(keypoint, tracks.starts))
-        moved = Tracks.in_order(np.argsort(points)[tracks.point], view, tracks.keypoint)
+        moved = tracks.in_order(np.argsort(points)[tracks.point], view, tracks.keypoint)
         return Structure(self.x_in_world[points] + offset, moved, self.noise)
 
     def shifted(self, offset: Array) -> Structure:
@@ -174,11 +173,7 @@ class Structure:
 
     def and_last(self, x_in_world: Array, tracks: Tracks, planes: DepthPlanes | None = None) -> Structure:
         """Appends points (Q, 3) with their tracks; without `planes`, none of these is near a plane."""
-        both = Tracks(
-            np.concatenate([self.tracks.point, len(self.x_in_world) + tracks.point]),
-            np.concatenate([self.tracks.view, tracks.view]),
-            np.concatenate([self.tracks.keypoint, tracks.keypoint]),
-        )
+        both = self.tracks.and_last(tracks, len(self.x_in_world))
         if self.planes is not None:
             planes = self.planes.and_last(planes or DepthPlanes.unknown(len(x_in_world)))
         return Structure(np.concatenate([self.x_in_world, x_in_world]), both, self.noise, planes)
