@@ -147,6 +147,8 @@ class Settings(BaseModel):
     """Address of the metrics; 0.0.0.0 for all."""
     metrics_port: int = Field(default=9464, ge=0, le=65535)
     """Port of the metrics; 0 for any free one."""
+    metrics_scenes: int = Field(default=20, ge=0, le=1000)
+    """Scenes with metrics of their own, those with most photographs of the last week, by their names; 0: none."""
     otlp_endpoint: str = ""
     """Address of the collector of traces, OTLP over gRPC, http://host:4317; empty: no traces."""
     reflection: bool = True

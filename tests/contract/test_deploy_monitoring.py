@@ -20,6 +20,7 @@ from prometheus_client import generate_latest
 from mapless_server.cache import LruCache
 from mapless_server.method.coarse.token_cache import TokenCacheCounters
 from mapless_server.observability.metrics import LOCALIZED, STAGES, Metrics
+from mapless_server.observability.scraped import SceneAge
 from mapless_server.settings import Settings
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
@@ -61,6 +62,7 @@ def everything_happened() -> Metrics:
     metrics.scraped.token_cache = TokenCacheCounters
     metrics.scraped.gpu_memory = lambda: {"allocated": 1.0, "reserved": 1.0, "peak": 1.0}
     metrics.scraped.certificate_expiry = lambda: 1.0
+    metrics.scraped.scenes = [SceneAge("hall", 100, 0.8, 0.9, 0.6, 1, 3, 2)]
     metrics.scraped.connections, metrics.scraped.most_connections = (lambda: 1), (lambda: 768)
     return metrics
 

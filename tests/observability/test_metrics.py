@@ -21,6 +21,7 @@ from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
 from mapless_server.observability.metrics import COUNTED, LOCALIZED, STAGES, Metrics
+from mapless_server.observability.scraped import SceneAge
 from mapless_server.scheduling import Ending, Refusal, StageLoad
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
@@ -87,6 +88,7 @@ def count_everything(metrics: Metrics) -> None:
     metrics.scraped.token_cache = lambda: TOKENS
     metrics.scraped.gpu_memory = lambda: {"allocated": 10.0, "reserved": 20.0}
     metrics.scraped.certificate_expiry = lambda: 2e9
+    metrics.scraped.scenes = [SceneAge("hall", 100, 0.75, 0.9, None, 1, 3, 2)]
 
 
 @pytest.fixture

@@ -68,7 +68,7 @@ def test_photographs_are_counted_by_place_and_reason(client: Client, scene: str,
     assert suggested.place_id == "r2"
     assert [suggested.photograph_count, suggested.distance_m] == pytest.approx([3.0, 40.0], rel=0.01)
     assert "3 of 3 photographs around r2 were rejected" in suggested.message
-    assert "40 m from r2: add references there" in suggested.message
+    assert "40 m from r2, looking along (" in suggested.message
 
 
 def test_a_confidential_photograph_is_not_counted(client: Client, scene: str) -> None:

@@ -105,3 +105,22 @@ def test_adding_to_many_scenes_is_one_transaction(place: Place) -> None:
         counts.add_counts(store.database, {it: {KEY: ONE} for it in [*scenes, SceneKey("gone")]})
         assert counts.scenes_created(store.database, [*scenes, SceneKey("gone")]).keys() == set(scenes)
     assert place.fetch("SELECT COUNT(*) FROM scene_count") == [(3,)]
+
+
+def test_the_scenes_with_most_photographs_are_named(place: Place) -> None:
+    hall, yard, quiet = (SceneKey(it) for it in ("hall", "yard", "quiet"))
+    localized = CountKey(MONDAY, "p", LOCALIZED)
+    with place.open() as store:
+        for it in (hall, yard, quiet):
+            store.create_scene(it)
+        planted = {
+            hall: {KEY: ONE.times(3), localized: Sums(photograph_count=2)},
+            yard: {localized._replace(day=MONDAY + 1): Sums(photograph_count=9)},
+            quiet: {localized: Sums(photograph_count=1), localized._replace(day=MONDAY - 1): Sums(photograph_count=50)},
+        }
+        counts.add_counts(store.database, planted)
+        assert counts.busiest_scenes(store.database, MONDAY, 7, 3) == [
+            (yard, 9, 9, 0, 0),
+            (hall, 5, 2, 0, 0),
+            (quiet, 1, 1, 50, 50),
+        ]

@@ -114,10 +114,11 @@ def _periods(report: SceneReport) -> list[str]:
     head = ["FROM", "PHOTOGRAPHS", "LOCALIZED", "68 % WITHIN", "INLIERS", *(["SURVEYED"] * has_adopted), "REJECTED"]
     rows = []
     for it in report.periods:
-        row = [f"{it.first_day}", it.photograph_count, percent(it.localized_share), _radius(it, report.arbitrary_unit)]
-        row += ["" if it.inlier_count is None else f"{it.inlier_count:.0f}"]
-        row += [percent(it.surveyed_share)] * has_adopted
-        rows.append([*row, reasons(it.rejections)])
+        inliers = "" if it.inlier_count is None else f"{it.inlier_count:.0f}"
+        numbers = [percent(it.localized_share), _radius(it, report.arbitrary_unit), inliers]
+        numbers += [percent(it.surveyed_share)] * has_adopted
+        aligned = [text.rjust(len(name)) for text, name in zip(numbers, head[2:], strict=False)]
+        rows.append([f"{it.first_day}", it.photograph_count, *aligned, reasons(it.rejections)])
     return table(head, rows)
 
 

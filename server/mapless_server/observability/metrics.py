@@ -1,8 +1,9 @@
 """Every metric of the server: names, labels, buckets, and the events that change them.
 
 Each server has a registry of its own, so that several can run in one process. No label has values that callers choose:
-scenes, tenants and requests are in the log. Series whose labels are known beforehand exist from the start, because a
-series that appears with its first event hides that event from `rate`.
+tenants and requests are in the log, and so are scenes, but for those with most photographs (`scraped.SceneAge`). Series
+whose labels are known beforehand exist from the start, because a series that appears with its first event hides that
+event from `rate`.
 """
 
 import math

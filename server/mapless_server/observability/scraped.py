@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
@@ -15,6 +15,42 @@ if TYPE_CHECKING:
     from mapless_server.store import LruCache
 
 log = logging.getLogger(__name__)
+
+
+class SceneAge(NamedTuple):
+    """How a scene ages; of the last seven days, all servers together.
+
+    Attributes:
+        name: its key, "scene" or "tenant/scene".
+        photographs: photographs that were answered.
+        localized_share: share of them that were localized.
+        localized_share_before: the same of the seven days before; None without any.
+        survey_left: least share of the survey that is left at a place; None where that is not known.
+        outdated_places: places that need a new survey.
+        adopted_references: adopted references that are in use.
+        retired_references: references that are retired.
+    """
+
+    name: str
+    photographs: int
+    localized_share: float
+    localized_share_before: float | None
+    survey_left: float | None
+    outdated_places: int
+    adopted_references: int
+    retired_references: int
+
+
+_OF_SCENES = {
+    "photographs": "Photographs of a scene that were answered in the last seven days, by all servers of the store.",
+    "localized_share": "Share of these that were localized.",
+    "localized_share_before": "The same of the seven days before.",
+    "survey_left": "Least share of the survey that is left at a place of the scene, where it adopts.",
+    "outdated_places": "Places of the scene that need a new survey.",
+    "adopted_references": "Adopted references of the scene that are in use.",
+    "retired_references": "References of the scene that are retired.",
+}
+"""Gauges of the scenes with most photographs, in the order of `SceneAge`."""
 
 
 class Scraped(Collector):
@@ -29,6 +65,7 @@ class Scraped(Collector):
         certificate_expiry: returns when the certificate expires, Unix seconds.
         connections: returns the number of open connections.
         most_connections: returns how many there may be.
+        scenes: how the scenes with most photographs age.
     """
 
     def __init__(self) -> None:
@@ -40,6 +77,7 @@ class Scraped(Collector):
         self.certificate_expiry: Callable[[], float] | None = None
         self.connections: Callable[[], int] | None = None
         self.most_connections: Callable[[], int] | None = None
+        self.scenes: Sequence[SceneAge] = ()
 
     def describe(self) -> Iterable[Metric]:
         """Implements Collector: only the names, when it is registered."""
@@ -48,7 +86,7 @@ class Scraped(Collector):
     def collect(self) -> Iterable[Metric]:
         """Implements Collector."""
         of_caches = self._reference_cache, self._retrieval_index, self._index_files, self._token_cache
-        for add_to in (*of_caches, self._gpu_memory, self._certificate, self._connections):
+        for add_to in (*of_caches, self._gpu_memory, self._certificate, self._connections, self._scenes):
             metrics: dict[str, Metric] = {}
             try:
                 add_to(metrics)
@@ -116,6 +154,13 @@ class Scraped(Collector):
             count.add_metric([], self.connections())
         if self.most_connections is not None:
             most.add_metric([], self.most_connections())
+
+    def _scenes(self, metrics: dict[str, Metric]) -> None:
+        gauges = [_gauge(metrics, f"mapless_scene_{name}", text, ["scene"]) for name, text in _OF_SCENES.items()]
+        for scene in self.scenes:
+            for gauge, value in zip(gauges, scene[1:], strict=True):
+                if value is not None:
+                    gauge.add_metric([scene.name], value)
 
 
 def _counter(metrics: dict[str, Metric], name: str, text: str, labels: Iterable[str] = ()) -> CounterMetricFamily:

@@ -2,8 +2,8 @@
 
 May import store, security, method, networks and images. Begin with `library` (loads references), `indexes` and
 `retrieval` (choose references), `background` (matches references ahead of queries), `audit`, `plausibility`,
-`depth_checks` and `adoption` (which photographs become references). The package itself has the values that other rooms
-exchange with it.
+`depth_checks`, `adoption` (which photographs become references) and `report` (how photographs were answered). The
+package itself has the values that other rooms exchange with it.
 """
 
 from .audit.verdict import AuditVerdict, Coverage, CoverageVerdict, ReferenceAudit, Viewpoint

@@ -278,6 +278,9 @@ async def _start(
     counting = Counting(engine, store, metrics, settings.report_days)
     stack.push_async_callback(counting.close)
     _run_task(stack, counting.run())
+    from .aging import watch_scenes
+
+    _run_task(stack, watch_scenes(store, settings.metrics_scenes, metrics.scraped))
     await services.open(engine, adopter.offer, counting.note)
     _run_task(stack, adopter.run())
     from .idle import release_when_idle  # what it imports is loaded by now

@@ -189,8 +189,9 @@ def _sentence(it: Suggestion, reference_id: str, unit: str, is_outdated: bool) -
         return f"{many}, {why}; the place has changed: survey it again"
     if it.positioned_share < 0.5:
         return f"{many}, {why}; no prior says where they were taken: add references of what is seen from there"
+    along = ", ".join(f"{each:.1f}" for each in it.forward.tolist())
     where = f"on average at ({x:.2f}, {y:.2f}, {z:.2f}), {it.distance_m:.2g} {unit} from {reference_id}"
-    return f"{many}, {why}, {where}: add references there"
+    return f"{many}, {why}, {where}, looking along ({along}): add references there"
 
 
 def event_to_message(event: Event, scene_id: str, places: Mapping[str, str]) -> pb.ReferenceEvent:

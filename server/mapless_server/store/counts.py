@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, delete, select
+from sqlalchemy import Select, case, delete, func, select, true
 
 from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey
@@ -185,3 +185,50 @@ def find_references(database: Database, scene_key: SceneKey, keys: Collection[st
                 with suppress(DataLoss):
                     found[row.key] = rows.reference_record(row)
     return found
+
+
+class BusyScene(NamedTuple):
+    """A scene with numbers of its photographs of some last days, and of as many days before these."""
+
+    scene_key: SceneKey
+    photograph_count: int
+    localized_count: int
+    photographs_before: int
+    localized_before: int
+
+
+def busiest_scenes(database: Database, since_day: int, days: int, most: int) -> list[BusyScene]:
+    """The scenes with most photographs since a day, at most so many; and numbers of so many days before it."""
+    column = scene_count.c
+    is_now, is_localized = column.day >= since_day, column.outcome == LOCALIZED
+    conditions = true(), is_localized
+    numbers = [
+        func.sum(case((it & each, column.photograph_count), else_=0)) for it in (is_now, ~is_now) for each in conditions
+    ]
+    found: Select[Any] = (
+        select(column.scene_id, *numbers)
+        .where(column.day >= since_day - days)
+        .group_by(column.scene_id)
+        .having(numbers[0] > 0)
+        .order_by(numbers[0].desc(), column.scene_id)
+        .limit(most)
+    )
+    with database.read() as connection:
+        return [BusyScene(SceneKey(key), *map(int, counted)) for key, *counted in connection.execute(found)]
+
+
+class ReferenceNumbers(NamedTuple):
+    """Numbers of references of a scene: adopted ones in use, and retired ones."""
+
+    adopted_count: int
+    retired_count: int
+
+
+def count_references(database: Database, scene_key: SceneKey) -> ReferenceNumbers:
+    """Counts the adopted and the retired references of a scene."""
+    key, number = reference.c.key, select(func.count()).select_from(reference).where(reference.c.scene_id == scene_key)
+    adopted = number.join(adopted_reference, adopted_reference.c.reference_key == key).where(~queries.is_retired(key))
+    standing = reference_standing.c
+    retired = number.join(reference_standing, standing.reference_key == key).where(standing.retire_time_us.is_not(None))
+    with database.read() as connection:
+        return ReferenceNumbers(connection.scalar(adopted) or 0, connection.scalar(retired) or 0)

@@ -1,0 +1,45 @@
+"""How scenes age, as metrics say it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from support.stores import make_reference
+
+from mapless import Accuracy, AdoptionPolicy, Provenance, Voucher
+from mapless_server.observability.scraped import SceneAge
+from mapless_server.security import SceneKey
+from mapless_server.serve.aging import ages
+from mapless_server.store import RetirementReason, SceneAttributes, Store, adoption, counts
+from mapless_server.store.counts import DAY_US, LOCALIZED, CountKey, Sums
+from mapless_server.store.records import Standing
+from mapless_server.store.rows import now_us
+
+HALL = SceneKey("acme/hall")
+
+
+def test_a_scene_that_ages_has_metrics(tmp_path: Path) -> None:
+    with Store.open(tmp_path) as store:
+        store.create_scene(HALL, SceneAttributes(adoption=AdoptionPolicy(min_surveyed_share=0.4)))
+        keys = {it.reference_id: it.key for it in store.add_references(HALL, [make_reference(it) for it in "abc"])}
+        known = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("a", 40),))
+        for name in ("x", "y"):
+            new = replace(make_reference(name), provenance=known, place_key=keys["a"])
+            adoption.adopt(store, HALL, new, 9)
+        adoption.retire(store, HALL, [keys["c"]], RetirementReason.CONTRADICTED)
+        shares = {keys["a"]: 0.35, keys["b"]: 0.7}
+        adoption.change_standings(
+            store.database, shares, lambda key, _: Standing(surveyed_share=shares[key], photograph_count=20)
+        )
+        today = now_us() // DAY_US
+        planted = {
+            CountKey(today, "p", LOCALIZED): Sums(photograph_count=6),
+            CountKey(today - 6, "p", "gate"): Sums(photograph_count=2),
+            CountKey(today - 7, "p", "gate"): Sums(photograph_count=1),
+            CountKey(today - 13, "p", LOCALIZED): Sums(photograph_count=9),
+            CountKey(today - 14, "p", "gate"): Sums(photograph_count=90),
+        }
+        counts.add_counts(store.database, {HALL: planted})
+        assert ages(store, 5) == [SceneAge(HALL, 8, 0.75, 0.9, 0.35, 1, 2, 1)]
+        assert ages(store, 0) == []
+        store.delete_scene(HALL)
+        assert ages(store, 5) == []
