@@ -258,6 +258,8 @@ class Rejected:
         capture_time, session_from_camera: as they were sent.
         scene: name of the scene in whose world the poses are; of several, the one whose references matched best. Empty
             if none of several has a reference, and from servers before 0.4.
+        outdated_place: name of the reference whose place needs a new survey, if the photograph was compared with
+            references of such a place of a scene that adopts; else empty, and from servers before 0.4.
         is_final: always True.
     """
 
@@ -272,6 +274,7 @@ class Rejected:
     debug: Debug | None = None
     used_intrinsics: UsedIntrinsics | None = None
     scene: str = ""
+    outdated_place: str = ""
     is_final: bool = field(default=True, init=False)
 
     def __str__(self) -> str:

@@ -208,7 +208,7 @@ class GroupRejected:
         images: contribution of each photograph, in order.
         hint, hypotheses: as of `Rejected`.
         capture_time: as it was sent.
-        scene: as of `Rejected`.
+        scene, outdated_place: as of `Rejected`.
     """
 
     reason: str
@@ -218,6 +218,7 @@ class GroupRejected:
     hypotheses: tuple[Hypothesis, ...] = ()
     capture_time: datetime | None = None
     scene: str = ""
+    outdated_place: str = ""
 
     def __str__(self) -> str:
         return rejection_text(

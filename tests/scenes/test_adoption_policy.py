@@ -67,24 +67,67 @@ def test_a_mask_ignores_what_is_explained() -> None:
     np.testing.assert_array_equal(decoded == 0, explained)
 
 
-def test_a_place_is_that_of_the_nearest_similar_viewpoint() -> None:
+def test_only_what_looks_about_the_same_way_should_show_it() -> None:
     centres = np.array([[0.0, 0, 0], [1.0, 0, 0], [5.0, 0, 0]])
     axes = np.array([[0.0, 0, -1], [0.0, 0, 1], [0.0, 0, 1]])
-    assert rules.nearest_viewpoint(centres, axes, at(0.2)) == 1
-    assert rules.nearest_viewpoint(centres, -np.abs(axes), at(0.2)) == 0
     np.testing.assert_array_equal(rules.should_show(centres, axes, at(0.8), 2.0, OPTIONS), [1])
     assert not len(rules.should_show(centres, axes, at(0.8, 20.0), 2.0, OPTIONS))
 
 
-def test_a_place_is_outdated_by_several_photographs() -> None:
+def shown(known: Standing, share: float, days: int, *holders: str, each: int = 1) -> Standing:
+    """What is known of a place after photographs on so many further days, `each` of each of these holders."""
+    first = int(known.surveyed_by[-1].partition(":")[0]) + 1 if known.surveyed_by else 10_000
+    for day in range(first, first + days):
+        for holder in holders * each:
+            known = rules.with_share(known, share, day * rules.DAY_US, holder, OPTIONS)
+    return known
+
+
+@pytest.mark.parametrize(
+    ("days", "holders", "is_outdated"),
+    [
+        (5, ("",), True),
+        (4, ("",), False),  # one of each holder counts a day
+        (3, ("one", "two"), True),
+        (2, ("one", "two", "three"), False),  # on two days
+        (1000, ("one",), False),  # of one holder
+    ],
+)
+def test_photographs_of_days_and_holders_outdate_a_place(
+    days: int, holders: tuple[str, ...], is_outdated: bool
+) -> None:
+    known = shown(Standing(), 0.1, days, *holders, each=20)
+    assert rules.needs_survey(known, POLICY, OPTIONS) is is_outdated
+
+
+def test_one_holder_outdates_no_place_that_others_confirm() -> None:
     known = Standing()
-    for _ in range(4):
-        known = rules.with_share(known, 0.1, OPTIONS)
-    assert not rules.is_outdated(known, POLICY, OPTIONS)
-    assert rules.is_outdated(rules.with_share(known, 0.1, OPTIONS), POLICY, OPTIONS)
-    for _ in range(10):
-        known = rules.with_share(known, 0.9, OPTIONS)
-    assert not rules.is_outdated(known, POLICY, OPTIONS)
+    for _ in range(20):
+        known = shown(known, 0.0, 1, "attacker", each=20)
+        known = shown(known, 0.9, 1, "one")
+    assert not rules.needs_survey(known, POLICY, OPTIONS)
+    assert known.surveyed_share == pytest.approx(0.45)
+
+
+def test_a_busy_day_leaves_days_before_remembered() -> None:
+    known = shown(Standing(), 0.1, 4, *(f"holder-{i}" for i in range(100)))
+    assert len({it.partition(":")[0] for it in known.surveyed_by}) >= OPTIONS.contradicting_days
+    assert rules.needs_survey(known, POLICY, OPTIONS)
+
+
+def test_a_photograph_counts_for_the_places_around_it() -> None:
+    centres = np.array([[0.0, 0, 0], [0.5, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [0.1, 0, 0]])
+    axes = np.array([[0.0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, 1], [0, 0, -1]])
+
+    def around(x_m: float, distance_m: float, ahead: float = 1.0) -> list[int]:
+        centre, axis = np.array([x_m, 0, 0]), np.array([0.0, np.sqrt(1 - ahead**2), ahead])
+        return rules.nearest_viewpoints(centres, axes, centre, axis, OPTIONS, distance_m)
+
+    assert around(0.1, 2.0) == [0, 1, 2]
+    assert around(0.1, 0.2) == [0]
+    assert around(0.1, 10.0) == [0, 1, 2, 3]
+    assert around(9.0, 1.0) == [3]
+    assert around(0.1, 2.0, ahead=0.0) == [4]  # none looks there
 
 
 def contradicted(days: int, *holders: str, each: int = 1) -> Standing:

@@ -155,6 +155,13 @@ def test_the_least_useful_of_a_full_place_goes_first(held: Held) -> None:
     assert held.adopted != [first]
 
 
+def _noise() -> bytes:
+    """A photograph of nothing."""
+    image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (720, 960, 3), np.uint8), (0, 0), 3)
+    _, jpeg = cv2.imencode(".jpg", cv2.normalize(image, np.empty_like(image), 0, 255, cv2.NORM_MINMAX))
+    return jpeg.tobytes()
+
+
 def _pixels(photograph: Photograph) -> NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(np.frombuffer(photograph.data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
 
@@ -195,14 +202,34 @@ def test_what_was_adopted_is_deleted_by_its_age(held: Held) -> None:
 
 def test_a_place_with_too_little_survey_left_is_named(held: Held) -> None:
     assert held.consider(held.candidate(held.place.queries[0])) is None
-    candidate = held.candidate(held.place.queries[0])
+    candidate, now = held.candidate(held.place.queries[0]), datetime.now(timezone.utc)
     crowded = replace(candidate, answered=replace(candidate.answered, inlier_count=10_000))
-    for _ in range(6):
-        assert held.consider(crowded) in (Refusal.LITTLE_SURVEYED, Refusal.UNSUPPORTED)
+    try:
+        for day in range(1, 6):
+            assert held.store.list_retirements(ROOM, held.adopted) == {}
+            held.adopter._now = partial(now.__add__, timedelta(days=day))
+            for _ in range(2):  # one holder counts once a day
+                assert held.consider(crowded) in (Refusal.LITTLE_SURVEYED, Refusal.UNSUPPORTED)
+    finally:
+        held.adopter._now = lambda: datetime.now(timezone.utc)
     assert held.consider(candidate) is Refusal.LITTLE_SURVEYED  # until there is a new survey
     (retired,) = held.store.list_retirements(ROOM, held.adopted).values()
     assert retired.reason is RetirementReason.SURVEY_OUTDATED
     assert any("survey these places again" in it for it in held.client.get_scene("room").warnings)
+    rejected = held.client.localize(_noise(), held.place.queries[0].camera, "room")
+    assert isinstance(rejected, Rejected)
+    outdated = adoption.list_outdated(held.store.database, ROOM).values()
+    assert rejected.outdated_place.rpartition("/")[2] in outdated
+    assert rejected.hint is not None
+    assert rejected.outdated_place.rpartition("/")[2] in rejected.hint.message
+    held.maintain()
+    assert list(adoption.list_outdated(held.store.database, ROOM).values()) == list(outdated)
+    here = held.place.references[1::2]
+    held.client.add_references("room", [it.reference() for it in here])
+    held.maintain()
+    assert adoption.list_outdated(held.store.database, ROOM) == {}
+    assert held.client.get_scene("room").warnings == ()
+    assert held.consider(candidate) is not Refusal.LITTLE_SURVEYED
 
 
 def test_a_contradicted_reference_is_retired_and_restored(held: Held) -> None:

@@ -24,7 +24,7 @@ from mapless_server.store import Store, adoption
 
 def candidate(tenant: str = "one", size_bytes: int = 1, offered_s: float = 0.0, mask: bytes = b"") -> Candidate:
     query = SimpleNamespace(scene_key=key_of(tenant, "room"), photo=SimpleNamespace(size_bytes=size_bytes, mask=mask))
-    return Candidate(cast(Query, query), cast(Evidence, None), np.empty((0, 2)), "", offered_s)
+    return Candidate(cast(Query, query), cast(Evidence, None), np.empty((0, 2)), 1.0, "", offered_s)
 
 
 def tenants(waiting: Waiting) -> list[str]:
@@ -88,6 +88,7 @@ async def test_vouchers_are_looked_up_after_changes_only(monkeypatch: pytest.Mon
     monkeypatch.setattr(adoption, "list_expired", lambda *_: [])
     monkeypatch.setattr(adoption, "list_adopting_scenes", lambda _: dict(generations))
     monkeypatch.setattr(adoption, "missing_vouchers", looked_up)
+    monkeypatch.setattr(adoption, "list_outdated_scenes", lambda _: {})
     stored = cast(Store, SimpleNamespace(database=None))
     its = adopter.Adopter(cast(QueueEngine, None), stored, cast(BackgroundObserver, None), 24.0)
     for generation, count in ((1, 1), (1, 1), (2, 2)):

@@ -206,6 +206,8 @@ def test_standings_are_counted_and_forgotten_when_restored(place: Place) -> None
                 surveyed_share=0.25,
                 photograph_count=5,
                 contradicted_by=("7:", "8:a"),
+                surveyed_by=("7::25", "8:a:30"),
+                outdate_time_us=9,
             )
 
         change: Callable[[str, Standing], Standing] = counted
@@ -213,11 +215,11 @@ def test_standings_are_counted_and_forgotten_when_restored(place: Place) -> None
             made = adoption.change_standings(store.database, [keys["a"], "gone"], change)
         assert (
             made
-            == {keys["a"]: Standing(2, 0, 0.25, 5, ("7:", "8:a"))}
+            == {keys["a"]: Standing(2, 0, 0.25, 5, ("7:", "8:a"), ("7::25", "8:a:30"), 9)}
             == adoption.read_standings(store.database, keys.values())
         )
-        assert adoption.list_places(store.database, HALL, 5) == {"a": 0.25}
-        assert adoption.list_places(store.database, HALL, 6) == {}
+        assert adoption.list_outdated(store.database, HALL) == {keys["a"]: "a"}
+        assert adoption.list_outdated_scenes(store.database) == {HALL: {keys["a"]: 9}}
         adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
         store.restore_reference(HALL, "a")
         assert adoption.read_standings(store.database, keys.values()) == {}

@@ -546,20 +546,22 @@ class Accuracy(_message.Message):
     def __init__(self, position_68_m: _Optional[float] = ..., position_95_m: _Optional[float] = ..., rotation_68_deg: _Optional[float] = ..., rotation_95_deg: _Optional[float] = ..., calibrated: bool = ..., calibration: _Optional[_Union[CalibrationSource, str]] = ..., sample_size: _Optional[int] = ...) -> None: ...
 
 class Rejection(_message.Message):
-    __slots__ = ("reason", "message", "hint", "hypotheses", "intrinsics_checks", "used_intrinsics")
+    __slots__ = ("reason", "message", "hint", "hypotheses", "intrinsics_checks", "used_intrinsics", "outdated_place")
     REASON_FIELD_NUMBER: _ClassVar[int]
     MESSAGE_FIELD_NUMBER: _ClassVar[int]
     HINT_FIELD_NUMBER: _ClassVar[int]
     HYPOTHESES_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_CHECKS_FIELD_NUMBER: _ClassVar[int]
     USED_INTRINSICS_FIELD_NUMBER: _ClassVar[int]
+    OUTDATED_PLACE_FIELD_NUMBER: _ClassVar[int]
     reason: RejectionReason
     message: str
     hint: Hint
     hypotheses: _containers.RepeatedCompositeFieldContainer[Hypothesis]
     intrinsics_checks: _containers.RepeatedCompositeFieldContainer[IntrinsicsCheck]
     used_intrinsics: UsedIntrinsics
-    def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ..., hint: _Optional[_Union[Hint, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., intrinsics_checks: _Optional[_Iterable[_Union[IntrinsicsCheck, _Mapping]]] = ..., used_intrinsics: _Optional[_Union[UsedIntrinsics, _Mapping]] = ...) -> None: ...
+    outdated_place: str
+    def __init__(self, reason: _Optional[_Union[RejectionReason, str]] = ..., message: _Optional[str] = ..., hint: _Optional[_Union[Hint, _Mapping]] = ..., hypotheses: _Optional[_Iterable[_Union[Hypothesis, _Mapping]]] = ..., intrinsics_checks: _Optional[_Iterable[_Union[IntrinsicsCheck, _Mapping]]] = ..., used_intrinsics: _Optional[_Union[UsedIntrinsics, _Mapping]] = ..., outdated_place: _Optional[str] = ...) -> None: ...
 
 class Hint(_message.Message):
     __slots__ = ("stage", "advice", "message", "best_reference")

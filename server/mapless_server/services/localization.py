@@ -185,6 +185,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             call.note(scene=result.scene_key, searched_scenes=result.searched_scene_count)
         if isinstance(answer.outcome, Localization):
             call.note(pose_stage=answer.outcome.pose_stage.value)
+        await self._name_outdated(response, [result])
         self._report(answer.outcome, response.localization, [result], call, answer.scale)
         is_watched = result.scene_key in self._watchers.by_scene
         debug = await self._debug_of(answer, request.options.include_debug or is_watched)
@@ -198,6 +199,14 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         if self.offer is not None:
             self.offer(request, response, query, result, call.principal)
         return response
+
+    async def _name_outdated(self, response: Any, results: Sequence[Result]) -> None:
+        """Says in rejections, of scenes that adopt, which place needs a new survey."""
+        if response.WhichOneof("outcome") != "rejection" or all(it.attributes.adoption is None for it in results):
+            return
+        from .outdated import name_outdated_place  # for these alone
+
+        await asyncio.to_thread(name_outdated_place, self._store, response.rejection, results)
 
     async def _debug_of(self, answer: Answer, is_wanted: bool) -> pb.Debug | None:
         """The evidence behind the pose, if the caller or a watcher of its scene wants it, and there is any."""
@@ -215,6 +224,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         pose = partial(pose_rig, rig_from_camera=rig_from_camera)
         group, outcome = await self._localize_group(queries, call, "images", pose)
         response = rig_to_message(outcome, group, queries, request, session_from_rig)
+        await self._name_outdated(response, group.results)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
 
@@ -229,6 +239,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         pose = partial(pose_sequence, session_from_camera=session_from_camera, estimate_scale=scale_is_free)
         group, outcome = await self._localize_group(queries, call, "frames", pose)
         response = sequence_to_message(outcome, group, queries, request, axes)
+        await self._name_outdated(response, group.results)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
 

@@ -59,7 +59,6 @@ from .reach import Reach, check_stays_in_reach
 from .reports import scene_report
 
 if TYPE_CHECKING:  # services do not load what computes
-    from mapless.scenes import AdoptionPolicy
     from mapless_server.engine.queue_engine import QueueEngine
     from mapless_server.scenes import ReferenceAudit
     from mapless_server.scenes.agreement import Agreement
@@ -118,7 +117,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         if not agreement.contradicts_itself:  # else what its references say of lenses is of no use
             warnings |= await self._stored(self._lens_warnings, key)
         if scene.attributes.adoption is not None:
-            warnings |= await self._stored(self._outdated_places, key, scene.attributes.adoption)
+            warnings |= await self._stored(self._outdated_places, key)
         return pb.GetSceneResponse(
             scene=scene_to_message(scene),
             warnings=warnings,
@@ -145,13 +144,11 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         newest = max((it.generation for it in known.self_calibrations), default=0)
         return dict.fromkeys(it.lens for it in known.self_calibrations if it.lens and it.generation == newest)
 
-    def _outdated_places(self, key: SceneKey, policy: AdoptionPolicy) -> dict[str, None]:
+    def _outdated_places(self, key: SceneKey) -> dict[str, None]:
         """Says which places of a scene that adopts need a new survey."""
-        from mapless_server.scenes.adoption.policy import AdoptionOptions  # services do not load what computes
         from mapless_server.store import adoption
 
-        shares = adoption.list_places(self._store.database, key, AdoptionOptions().least_photographs)
-        outdated = [name for name, share in shares.items() if share < policy.min_surveyed_share]
+        outdated = list(adoption.list_outdated(self._store.database, key).values())
         return dict.fromkeys([outdated_places(outdated)] if outdated else [])
 
     async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:

@@ -10,6 +10,7 @@ Two servers that adopt one photograph give it the same id, so that the database 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
@@ -185,21 +186,55 @@ def read_standings(database: Database, keys: Collection[str]) -> dict[str, Stand
         return {it.reference_key: rows.standing(it) for it in found}
 
 
-def list_places(database: Database, scene_key: SceneKey, least_photographs: int) -> dict[str, float]:
-    """Share of matches with surveyed references in photographs of a scene's places, by id of their reference, ordered.
-
-    Only of places of which there were so many photographs.
-    """
-    standing = reference_standing.c
+def list_outdated(database: Database, scene_key: SceneKey) -> dict[str, str]:
+    """Ids of the references whose places need a new survey, by key, ordered by id; empty if there is no such scene."""
     statement: Select[Any] = (
-        select(reference.c.reference_id, standing.surveyed_share)
-        .join(reference_standing, standing.reference_key == reference.c.key)
-        .where(reference.c.scene_id == scene_key, standing.photograph_count >= least_photographs)
-        .where(standing.surveyed_share.is_not(None))
+        select(reference.c.key, reference.c.reference_id)
+        .join(reference_standing, reference_standing.c.reference_key == reference.c.key)
+        .where(reference.c.scene_id == scene_key, reference_standing.c.outdate_time_us.is_not(None))
         .order_by(reference.c.reference_id)
     )
     with database.read() as connection:
-        return {it.reference_id: it.surveyed_share for it in connection.execute(statement)}
+        return {it.key: it.reference_id for it in connection.execute(statement)}
+
+
+def list_outdated_scenes(database: Database) -> dict[SceneKey, dict[str, int]]:
+    """The references whose places need a new survey, since when, microseconds since 1970, by key and by scene."""
+    found = dict[SceneKey, dict[str, int]]()
+    statement: Select[Any] = (
+        select(reference.c.scene_id, reference.c.key, reference_standing.c.outdate_time_us)
+        .join(reference_standing, reference_standing.c.reference_key == reference.c.key)
+        .where(~queries.is_detached(reference.c.scene_id), reference_standing.c.outdate_time_us.is_not(None))
+        .order_by(reference.c.scene_id, reference.c.key)
+    )
+    with database.read() as connection:
+        for it in connection.execute(statement):
+            found.setdefault(SceneKey(it.scene_id), {})[it.key] = it.outdate_time_us
+    return found
+
+
+def list_surveyed_since(database: Database, scene_key: SceneKey, time_us: int) -> dict[str, int]:
+    """When the surveyed references of a scene were stored, by key, of those that were stored after a time."""
+    column = reference.c
+    statement: Select[Any] = select(column.key, column.create_time_us).where(
+        column.scene_id == scene_key,
+        column.create_time_us > time_us,
+        column.key.not_in(select(adopted_reference.c.reference_key)),
+        ~queries.is_retired(column.key),
+    )
+    with database.read() as connection:
+        return {it.key: it.create_time_us for it in connection.execute(statement)}
+
+
+def places_of(database: Database, keys: Sequence[str]) -> list[str]:
+    """Key of the surveyed reference of whose place each reference is; of a surveyed one its own."""
+    column = adopted_reference.c
+    with database.read() as connection:
+        rows_found = connection.execute(
+            select(column.reference_key, column.place_key).where(column.reference_key.in_(sorted(keys)))
+        )
+        place_of = {it.reference_key: it.place_key for it in rows_found}
+    return [place_of.get(key, key) for key in keys]
 
 
 def change_standings(
@@ -218,9 +253,20 @@ def change_standings(
             queries.insert_new(connection, reference_standing, {"reference_key": key})
             row = connection.execute(select(reference_standing).where(column.reference_key == key).with_for_update())
             made[key] = change(key, rows.standing(row.one()))
-            values = vars(made[key]) | {"contradicted_by": " ".join(made[key].contradicted_by)}
+            values = dict(vars(made[key]))
+            values |= {name: " ".join(values[name]) for name in ("contradicted_by", "surveyed_by")}
             connection.execute(update(reference_standing).where(column.reference_key == key).values(values))
     return made
+
+
+def outdated(standing: Standing) -> Standing:
+    """What is known of a place that needs a new survey from now on, by the store's clock."""
+    return replace(standing, outdate_time_us=rows.now_us())
+
+
+def surveyed_again(standing: Standing) -> Standing:
+    """What is known of a place that has a new survey: nothing of it, yet."""
+    return replace(standing, surveyed_share=None, photograph_count=0, surveyed_by=(), outdate_time_us=None)
 
 
 def retire(store: Store, scene_key: SceneKey, keys: Sequence[str], reason: RetirementReason) -> list[str]:

@@ -238,8 +238,11 @@ class Standing:
         contradiction_count: photographs in a row that should show what it shows, and do not.
         contradiction_time_us: when the last one was counted, microseconds since 1970.
         contradicted_by: the day and the holder of each of the last ones, see `adoption.policy.with_photograph`.
-        surveyed_share: of a surveyed one, the share of matches with surveyed references in photographs of its place, a
-            running mean over `photograph_count` of them; None without any.
+        surveyed_share: of a surveyed one, the share of matches with surveyed references in photographs of its place,
+            mean over the last ones; None without any.
+        photograph_count: photographs of its place that were counted.
+        surveyed_by: day, holder and share of the last ones, see `adoption.policy.with_share`.
+        outdate_time_us: since when its place needs a new survey, microseconds since 1970; None if it does not.
     """
 
     contradiction_count: int = 0
@@ -247,6 +250,8 @@ class Standing:
     surveyed_share: float | None = None
     photograph_count: int = 0
     contradicted_by: tuple[str, ...] = ()
+    surveyed_by: tuple[str, ...] = ()
+    outdate_time_us: int | None = None
 
 
 @dataclass(frozen=True, eq=False)

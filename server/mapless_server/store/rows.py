@@ -164,8 +164,15 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
 
 def standing(row: Row[Any]) -> Standing:
     """Reads columns of the table `reference_standing`."""
-    counted, witnesses = (row.contradiction_count, row.contradiction_time_us), tuple(row.contradicted_by.split())
-    return Standing(*counted, row.surveyed_share, row.photograph_count, witnesses)
+    return Standing(
+        row.contradiction_count,
+        row.contradiction_time_us,
+        row.surveyed_share,
+        row.photograph_count,
+        tuple(row.contradicted_by.split()),
+        tuple(row.surveyed_by.split()),
+        row.outdate_time_us,
+    )
 
 
 def retirement(row: Row[Any]) -> Retirement | None:

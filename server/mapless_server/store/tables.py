@@ -17,7 +17,7 @@ from sqlalchemy import (
     text,
 )
 
-SCHEMA_VERSION = 15
+SCHEMA_VERSION = 16
 
 metadata = MetaData()
 
@@ -145,6 +145,9 @@ reference_standing = Table(
     # Of a surveyed one: the share of matches with surveyed references in photographs of its place, a running mean.
     Column("surveyed_share", Double),
     Column("photograph_count", Integer, nullable=False, server_default=_NONE_YET),
+    # "DAY:HOLDER:PERCENT" of the last of these photographs, separated by spaces; each holder counts once a day.
+    Column("surveyed_by", Text, nullable=False, server_default=text("''")),
+    Column("outdate_time_us", BigInteger),  # since when the place needs a new survey; null if it does not
     Column("retire_time_us", BigInteger),  # null if it is not retired
     Column("retire_reason", String(32)),
 )

@@ -8,7 +8,7 @@ else a thing that was moved, as a poster, would take a photograph of another pla
 
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -40,8 +40,11 @@ class AdoptionOptions:
         min_novelty: least share of a photograph's keypoints that are not near a match of its answer.
         explained_share: what is so near a match is explained by it, share of the image's longer side.
         first_usefulness: most usefulness of a new reference, so that it cannot at once push out one that proved useful.
-        remembered: photographs that a running mean remembers.
-        least_photographs: photographs of a place before its survey is said to be outdated.
+        remembered: photographs that a mean remembers.
+        least_photographs: least photographs of a place with too small a share of surveyed support before it is said to
+            need a new survey; they come on so many days, and from so many holders, as contradictions.
+        photographs_a_day: most photographs that count for a place on one day, so that several days are remembered.
+        places: most places that one photograph counts for: those whose references are around its viewpoint.
         same_viewpoint_deg, same_viewpoint_share: a photograph that looks in a direction so near to a reference's, from
             so near, a share of the distance to what it shows, should show what that shows.
         contradicting_share: such a photograph contradicts the reference where it has a smaller share of its matches
@@ -59,6 +62,8 @@ class AdoptionOptions:
     first_usefulness: float = 0.2
     remembered: int = 10
     least_photographs: int = 5
+    photographs_a_day: int = 3
+    places: int = 4
     same_viewpoint_deg: float = 15.0
     same_viewpoint_share: float = 0.15
     contradicting_share: float = 0.05
@@ -67,7 +72,7 @@ class AdoptionOptions:
     contradicting_holders: int = 2
 
     def __post_init__(self) -> None:
-        counts = "min_matches min_vouchers voucher_matches remembered least_photographs"
+        counts = "min_matches min_vouchers voucher_matches remembered least_photographs photographs_a_day places"
         check_bounds(self, f"{counts} contradictions contradicting_days contradicting_holders", at_least=1)
         check_bounds(self, "min_novelty first_usefulness contradicting_share", at_least=0, at_most=1)
         check_bounds(self, "explained_share same_viewpoint_share", above=0, at_most=1)
@@ -180,11 +185,15 @@ def mask_of(ignored: NDArray[np.bool_]) -> bytes:
     return png.tobytes()
 
 
-def nearest_viewpoint(centres: Array, axes: Array, pose: RigidTransform) -> int:
-    """Index of the reference that stands nearest to a pose, of those that look within 60 degrees, or of all.
+def nearest_viewpoints(
+    centres: Array, axes: Array, centre: Array, axis: Array, options: AdoptionOptions, distance_m: float = math.inf
+) -> list[int]:
+    """Indices of the references around a viewpoint, the nearest first: `places` of those that look within 60 degrees.
 
-    Centres (N, 3) and unit axes (N, 3) are in the world; at least one.
+    Those but the first stand within this distance, that of what a photograph there shows. If none looks within 60
+    degrees, the one that stands nearest of all. Centres and unit axes, (N, 3) and (3,), are in the world; N at least 1.
     """
+<<<<<<< HEAD
     return nearest_place(centres, axes, pose.translation, pose.rotation[:, 2])
 
 
@@ -193,6 +202,14 @@ def nearest_place(centres: Array, axes: Array, position: Array, forward: Array |
     distance = np.linalg.norm(centres - position, axis=1)
     looks = np.zeros(len(axes), bool) if forward is None else axes @ forward > 0.5
     return int(np.where(looks, distance, np.inf).argmin() if looks.any() else distance.argmin())
+=======
+    distance = np.linalg.norm(centres - centre, axis=1)
+    looks = axes @ axis > 0.5
+    if not looks.any():
+        return [int(distance.argmin())]
+    order = np.argsort(np.where(looks, distance, np.inf), kind="stable")[: min(options.places, int(looks.sum()))]
+    return [int(it) for i, it in enumerate(order) if i == 0 or distance[it] <= distance_m]
+>>>>>>> cc882bbf (Places need a new survey by photographs of several days and holders, rejections name them, a new survey ends it)
 
 
 def should_show(
@@ -204,18 +221,38 @@ def should_show(
     return np.flatnonzero(near & looks)
 
 
-def with_share(standing: Standing, share: float, options: AdoptionOptions) -> Standing:
-    """The knowledge of a place after another photograph, of which surveyed references support this share."""
-    mean = share if standing.surveyed_share is None else standing.surveyed_share
-    weight = 1 / min(standing.photograph_count + 1, options.remembered)
-    mean += weight * (share - mean)
-    return replace(standing, surveyed_share=mean, photograph_count=standing.photograph_count + 1)
+def with_share(standing: Standing, share: float, now_us: int, holder: str, options: AdoptionOptions) -> Standing:
+    """The knowledge of a place after another photograph, of which surveyed references support this share.
+
+    Each holder counts once a day (UTC), and each day with so many.
+    """
+    day = str(now_us // DAY_US)
+    today = [it for it in standing.surveyed_by if it.partition(":")[0] == day]
+    if len(today) >= options.photographs_a_day or any(it.split(":")[1] == holder for it in today):
+        return standing
+    witnesses = (*standing.surveyed_by, f"{day}:{holder}:{100 * share:.0f}")[-options.remembered :]
+    mean = float(np.mean([_share_of(it) for it in witnesses]))
+    count = standing.photograph_count + 1
+    return replace(standing, surveyed_share=mean, photograph_count=count, surveyed_by=witnesses)
 
 
-def is_outdated(standing: Standing, policy: AdoptionPolicy, options: AdoptionOptions) -> bool:
-    """Whether photographs of a place show too little of what was surveyed."""
-    share, count = standing.surveyed_share, standing.photograph_count
-    return share is not None and count >= options.least_photographs and share < policy.min_surveyed_share
+def _share_of(witness: str) -> float:
+    return float(witness.rpartition(":")[2]) / 100
+
+
+def needs_survey(standing: Standing, policy: AdoptionPolicy, options: AdoptionOptions) -> bool:
+    """Whether photographs of a place show too little of what was surveyed, on so many days and from so many holders."""
+    least, share = policy.min_surveyed_share, standing.surveyed_share
+    little = [it.rpartition(":")[0] for it in standing.surveyed_by if _share_of(it) < least]
+    is_little = share is not None and share < least and len(little) >= options.least_photographs
+    return is_little and _are_enough(little, options)
+
+
+def _are_enough(witnesses: Collection[str], options: AdoptionOptions) -> bool:
+    """Whether witnesses, "DAY:HOLDER", are of enough days, and of enough holders or one who may change the scene."""
+    days = {it.partition(":")[0] for it in witnesses}
+    holders = {it.partition(":")[2] for it in witnesses}
+    return len(days) >= options.contradicting_days and ("" in holders or len(holders) >= options.contradicting_holders)
 
 
 def holder_of(principal: Principal) -> str:
@@ -245,14 +282,8 @@ def with_photograph(standing: Standing, share: float, now_us: int, holder: str, 
 
 def is_contradicted(standing: Standing, options: AdoptionOptions) -> bool:
     """Whether photographs contradict a reference so often, on so many days and from so many holders that it retires."""
-    days = {it.partition(":")[0] for it in standing.contradicted_by}
-    holders = {it.partition(":")[2] for it in standing.contradicted_by}
-    are_enough = "" in holders or len(holders) >= options.contradicting_holders
-    return (
-        are_enough
-        and len(days) >= options.contradicting_days
-        and standing.contradiction_count >= options.contradictions
-    )
+    is_often = standing.contradiction_count >= options.contradictions
+    return is_often and _are_enough(standing.contradicted_by, options)
 
 
 def with_usefulness(usefulness: float, share: float, options: AdoptionOptions) -> float:

@@ -27,7 +27,7 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal
 from mapless_server.store import NewReference, Store, adoption
 
-from .evidence import evidence_of, inliers_px, keypoints_px
+from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px
 from .keeping import Keeper
 from .surveyed import Place, SurveyedLocalizer
 from .waiting import Candidate, Waiting
@@ -88,7 +88,7 @@ class Adopter:
             return
         kept = replace(query, photo=replace(query.photo, depth=None))
         holder, now_s = rules.holder_of(principal), time.monotonic()
-        left = self._waiting.add(Candidate(kept, evidence, inliers_px(result), holder, now_s))
+        left = self._waiting.add(Candidate(kept, evidence, inliers_px(result), distance_shown(result), holder, now_s))
         self._observer.count("adoptions", left, "queue")
 
     async def run(self) -> None:
@@ -134,7 +134,7 @@ class Adopter:
 
     async def maintain(self) -> None:
         """Deletes adopted references that are too old, and retires those whose vouching references are gone."""
-        await self._keeper.maintain(self._now())
+        await self._keeper.maintain(self._now(), self._options or AdoptionOptions())
 
     async def consider(self, candidate: Candidate) -> Refusal | None:
         """Adopts a photograph, or says why not; also counts what it says of the references around.
@@ -145,12 +145,13 @@ class Adopter:
         policy = (await asyncio.to_thread(self._store.get_attributes, scene_key)).adoption
         if policy is None:
             return self._counted(rules.Refusal.CHANGED)
-        place = await asyncio.to_thread(self._localizer.place, scene_key, candidate.answered.world_from_camera)
+        pose, distance_m = candidate.answered.world_from_camera, candidate.distance_m
+        place = await asyncio.to_thread(self._localizer.place, scene_key, pose, distance_m, options)
         if place is None:
             return self._counted(rules.Refusal.CHANGED)
         result = await self._localizer.localized(candidate.query, place.surveyed_ids, candidate.query.photo.mask)
         surveyed = self._localizer.evidence(candidate.query, result)
-        is_outdated = await self._keeper.learn(candidate, place, surveyed, policy, options)
+        is_outdated = await self._keeper.learn(candidate, place, surveyed, policy, self._now(), options)
         refused = rules.refusal(policy, candidate.answered, surveyed, options)
         if refused is None and is_outdated:
             refused = rules.Refusal.LITTLE_SURVEYED

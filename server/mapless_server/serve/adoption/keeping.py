@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 
@@ -46,8 +46,11 @@ class Keeper:
         self._checked: dict[SceneKey, int] = {}
         """Generations of the scenes at which all that vouches for their adopted references was looked up."""
 
-    async def maintain(self, now: datetime) -> None:
-        """Deletes adopted references that are too old, and retires those whose vouching references are gone."""
+    async def maintain(self, now: datetime, options: AdoptionOptions) -> None:
+        """Deletes adopted references that are too old, and retires those whose vouching references are gone.
+
+        Places that were surveyed again are not outdated any more.
+        """
         before = now - timedelta(hours=self._hours)
         for scene_key, reference_id in await asyncio.to_thread(adoption.list_expired, self._store.database, before):
             await asyncio.to_thread(self._delete, scene_key, reference_id)
@@ -59,6 +62,19 @@ class Keeper:
                 gone = [key for key, share in lost.items() if share > MOST_LOST_SHARE]
                 await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
         self._checked = scenes
+        outdated_in = await asyncio.to_thread(adoption.list_outdated_scenes, self._store.database)
+        for scene_key, outdated in outdated_in.items():
+            await asyncio.to_thread(self._end_outdated, scene_key, outdated, options)
+
+    def _end_outdated(self, scene_key: SceneKey, since_us: Mapping[str, int], options: AdoptionOptions) -> None:
+        """Ends what is said of outdated places, given since when, where surveyed references were added later."""
+        database, ended = self._store.database, list[str]()
+        created_us = adoption.list_surveyed_since(database, scene_key, min(since_us.values()))
+        for key, outdate_time_us in since_us.items():
+            later = [it for it, time_us in created_us.items() if time_us > outdate_time_us]
+            if later and key in self._localizer.surveyed_again(scene_key, later, options):
+                ended.append(key)
+        adoption.change_standings(database, ended, lambda _, known: adoption.surveyed_again(known))
 
     async def learn(
         self,
@@ -66,32 +82,41 @@ class Keeper:
         place: Place,
         surveyed: Evidence | None,
         policy: AdoptionPolicy,
+        now: datetime,
         options: AdoptionOptions,
     ) -> bool:
-        """Counts what a photograph says of its place, and of the adopted references there; whether it is outdated."""
-        database, answered, scene_key = self._store.database, candidate.answered, candidate.query.scene_key
-        share = rules.surveyed_share(answered, surveyed)
+        """Counts what a photograph says of the places around it, and of the adopted references at its own.
 
-        def learned(_: str, known: Standing) -> Standing:
+        Returns whether its own is outdated.
+        """
+        database, answered, scene_key = self._store.database, candidate.answered, candidate.query.scene_key
+        share, now_us = rules.surveyed_share(answered, surveyed), time_us(now)
+
+        def learned(key: str, known: Standing) -> Standing:
             # Once outdated it stays so until a new survey: answers by what is left of the old one say nothing.
             # A masked photograph shows what its mask has left.
-            is_left = bool(candidate.query.photo.mask) or rules.is_outdated(known, policy, options)
-            return known if is_left else rules.with_share(known, share, options)
+            if candidate.query.photo.mask or known.outdate_time_us is not None:
+                return known
+            made = rules.with_share(known, share, now_us, candidate.holder, options)
+            if not rules.needs_survey(made, policy, options):
+                return made
+            log.warning("scene %s: the place of %s needs a new survey", scene_key, place.id_of[key])
+            return adoption.outdated(made)
 
-        made = await asyncio.to_thread(adoption.change_standings, database, [place.key], learned)
-        here = [
-            it
-            for it in await asyncio.to_thread(adoption.list_adopted, database, scene_key)
-            if it.place_key == place.key and not it.is_retired
+        made = await asyncio.to_thread(adoption.change_standings, database, place.id_of, learned)
+        outdated = [key for key, it in made.items() if it.outdate_time_us is not None]
+        adopted = [
+            it for it in await asyncio.to_thread(adoption.list_adopted, database, scene_key) if not it.is_retired
         ]
-        if any(rules.is_outdated(it, policy, options) for it in made.values()):
-            if await self._retire(scene_key, [it.key for it in here], RetirementReason.SURVEY_OUTDATED):
-                log.warning("scene %s: the place of %s needs a new survey", scene_key, place.reference_id)
+        leaving = [it.key for it in adopted if it.place_key in outdated]
+        await self._retire(scene_key, leaving, RetirementReason.SURVEY_OUTDATED)
+        if place.key in outdated:
             return True
         total = max(answered.inlier_count, 1)
         useful = {
             it.key: rules.with_usefulness(it.usefulness, answered.inliers_of.get(it.reference_id, 0) / total, options)
-            for it in here
+            for it in adopted
+            if it.place_key == place.key
         }
         await asyncio.to_thread(adoption.set_usefulness, database, useful)
         return False

@@ -1,10 +1,11 @@
 """Localizes photographs a second time, from surveyed references alone: all that were not adopted."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapless.axes import Axes
 from mapless.geometry import Array, RigidTransform
@@ -15,6 +16,7 @@ from mapless_server.method.options import StageContext
 from mapless_server.scenes import ANYWHERE
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
+from mapless_server.scenes.retrieval.index import Entries
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey, tenant_of
 from mapless_server.services.messages.answers import AnswerFrames, outcome_to_message
@@ -38,16 +40,29 @@ class Place:
 
     Attributes:
         surveyed_ids, surveyed_keys, centres, axes: those that were not adopted; centres (N, 3) and axes (N, 3), world.
-        key: of the surveyed one that stands nearest, whose place it is.
-        reference_id: id of that one.
+        around: indices of those that stand around the candidate, the nearest first, whose place it is.
     """
 
     surveyed_ids: Sequence[str]
     surveyed_keys: Sequence[str]
     centres: Array
     axes: Array
-    key: str
-    reference_id: str
+    around: Sequence[int]
+
+    @property
+    def key(self) -> str:
+        """The key of the reference whose place it is."""
+        return self.surveyed_keys[self.around[0]]
+
+    @property
+    def reference_id(self) -> str:
+        """The id of that reference."""
+        return self.surveyed_ids[self.around[0]]
+
+    @property
+    def id_of(self) -> dict[str, str]:
+        """Ids of the references around, by key."""
+        return {self.surveyed_keys[i]: self.surveyed_ids[i] for i in self.around}
 
 
 class SurveyedLocalizer:
@@ -58,12 +73,12 @@ class SurveyedLocalizer:
         self._engine = engine
         self._store = store
 
-    def place(self, scene_key: SceneKey, pose: RigidTransform) -> Place | None:
-        """The references around a pose; None without surveyed ones."""
-        context = StageContext(lambda: None)
-        entries = self._engine.references.retrievals[0].indexes.entries(scene_key, context, waits=False)
-        adopted = [it.key for it in adoption.list_adopted(self._store.database, scene_key)]
-        rows = np.setdiff1d(entries.rows(), list(entries.rows_of_keys(adopted).values()), assume_unique=True)
+    def place(
+        self, scene_key: SceneKey, pose: RigidTransform, distance_m: float, options: AdoptionOptions
+    ) -> Place | None:
+        """The references around a pose at which a photograph shows what is so far away; None without surveyed ones."""
+        entries = self._entries(scene_key)
+        rows = self._surveyed_rows(scene_key, entries)
         distance = np.linalg.norm(entries.centres(rows) - pose.translation, axis=1)
         if len(rows) > MOST_CHOSEN_AMONG:
             some = np.argpartition(distance, MOST_CHOSEN_AMONG)[:MOST_CHOSEN_AMONG]
@@ -73,8 +88,28 @@ class SurveyedLocalizer:
             return None
         centres, axes = entries.centres(chosen), entries.axes(chosen)
         ids, keys = zip(*(entries.reference(row)[:2] for row in chosen.tolist()), strict=True)
-        nearest = rules.nearest_viewpoint(centres, axes, pose)
-        return Place(ids, keys, centres, axes, keys[nearest], ids[nearest])
+        around = rules.nearest_viewpoints(centres, axes, pose.translation, pose.rotation[:, 2], options, distance_m)
+        return Place(ids, keys, centres, axes, around)
+
+    def surveyed_again(self, scene_key: SceneKey, new_keys: Collection[str], options: AdoptionOptions) -> set[str]:
+        """Keys of the surveyed references around which new ones stand."""
+        entries = self._entries(scene_key)
+        new = list(entries.rows_of_keys(new_keys).values())
+        old = np.setdiff1d(self._surveyed_rows(scene_key, entries), new, assume_unique=True)
+        if not len(old):
+            return set()
+        centres, axes, found = entries.centres(old), entries.axes(old), set[int]()
+        for centre, axis in zip(entries.centres(np.array(new)), entries.axes(np.array(new)), strict=True):
+            found |= set(rules.nearest_viewpoints(centres, axes, centre, axis, options))
+        return {entries.reference(int(old[i]))[1] for i in found}
+
+    def _entries(self, scene_key: SceneKey) -> Entries:
+        context = StageContext(lambda: None)
+        return self._engine.references.retrievals[0].indexes.entries(scene_key, context, waits=False)
+
+    def _surveyed_rows(self, scene_key: SceneKey, entries: Entries) -> NDArray[np.intp]:
+        adopted = [it.key for it in adoption.list_adopted(self._store.database, scene_key)]
+        return np.setdiff1d(entries.rows(), list(entries.rows_of_keys(adopted).values()), assume_unique=True)
 
     async def localized(
         self, query: Query, reference_ids: Sequence[str], mask: bytes, *, rerank: bool = True

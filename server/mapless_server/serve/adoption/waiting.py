@@ -25,6 +25,7 @@ class Candidate:
         query: as it was asked.
         answered: its answer.
         inliers_px: (M, 2) the keypoints of the matches that agree with it, pixels of the photograph as it was sent.
+        distance_m: median distance of what it shows; see `evidence.distance_shown`.
         holder: its caller, see `policy.holder_of`.
         offered_s: when it was answered, by `time.monotonic`.
     """
@@ -32,6 +33,7 @@ class Candidate:
     query: Query
     answered: Evidence
     inliers_px: Array
+    distance_m: float
     holder: str
     offered_s: float
 
