@@ -71,7 +71,7 @@ class MetricsPage:
         while self.considered < count:
             if time.monotonic() > end_s:
                 raise TimeoutError(f"the server has considered {self.considered} photographs, not {count}")
-            time.sleep(0.05)
+            time.sleep(0.2)
 
 
 def free_port() -> int:

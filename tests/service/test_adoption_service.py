@@ -12,7 +12,6 @@ from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless_server.security import SceneKey
 from mapless_server.store import RetirementReason, Store, adoption
-from mapless_server.store.records import Standing
 
 ADOPTED = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("r0", 40), Voucher("r1", 20)))
 
@@ -136,13 +135,15 @@ def test_all_references_of_a_page_may_be_retired(client: Client, server: Running
 def test_places_that_need_a_new_survey_are_named(client: Client, server: RunningServer, adopting: str) -> None:
     key = key_of(server, adopting, "r2")
     adoption.change_standings(
-        store_of(server).database, [key], lambda _, it: replace(it, surveyed_share=0.2, photograph_count=5)
+        store_of(server).database,
+        [key],
+        lambda _, it: adoption.outdated(replace(it, surveyed_share=0.2, photograph_count=5)),
     )
     (warning,) = client.get_scene(adopting).warnings
     assert warning.startswith("photographs around r2 show too little of what was surveyed")
     places = {it.reference_id: it.place for it in client.list_references(adopting)}
     assert places == {"r0": None, "r1": None, "r2": PlaceState(0.2, 5, 0)}
-    assert Standing(0, 0, 0.2, 5) == adoption.read_standings(store_of(server).database, [key])[key]
+    assert adoption.read_standings(store_of(server).database, [key])[key].photograph_count == 5
 
 
 @pytest.mark.parametrize(
