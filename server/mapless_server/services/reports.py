@@ -70,10 +70,8 @@ def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRe
 
 
 def _is_outdated(scene: SceneRecord, place: ReferenceRecord) -> bool:
-    from mapless_server.scenes.adoption.policy import AdoptionOptions, is_outdated
-
-    policy, standing = scene.attributes.adoption, place.standing
-    return policy is not None and standing is not None and is_outdated(standing, policy, AdoptionOptions())
+    standing = place.standing
+    return scene.attributes.adoption is not None and standing is not None and standing.outdate_time_us is not None
 
 
 def days_from_message(request: pb.GetSceneReportRequest, today: date) -> tuple[int, int, int]:

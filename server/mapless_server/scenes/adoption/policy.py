@@ -185,31 +185,29 @@ def mask_of(ignored: NDArray[np.bool_]) -> bytes:
     return png.tobytes()
 
 
+def nearest_place(centres: Array, axes: Array, position: Array, forward: Array | None) -> int:
+    """Index of the reference that stands nearest to a position, of those that look within 60 degrees, or of all.
+
+    Of all, too, where the direction is not known. Centres and unit axes, (N, 3), position and direction, (3,), are in
+    the world; N is at least 1.
+    """
+    distance = np.linalg.norm(centres - position, axis=1)
+    looks = np.zeros(len(axes), bool) if forward is None else axes @ forward > 0.5
+    return int(np.where(looks, distance, np.inf).argmin() if looks.any() else distance.argmin())
+
+
 def nearest_viewpoints(
     centres: Array, axes: Array, centre: Array, axis: Array, options: AdoptionOptions, distance_m: float = math.inf
 ) -> list[int]:
     """Indices of the references around a viewpoint, the nearest first: `places` of those that look within 60 degrees.
 
-    Those but the first stand within this distance, that of what a photograph there shows. If none looks within 60
-    degrees, the one that stands nearest of all. Centres and unit axes, (N, 3) and (3,), are in the world; N at least 1.
+    The first is that of `nearest_place`; the others stand within this distance, that of what a photograph there shows.
+    Centres and unit axes, (N, 3) and (3,), are in the world; N is at least 1.
     """
-<<<<<<< HEAD
-    return nearest_place(centres, axes, pose.translation, pose.rotation[:, 2])
-
-
-def nearest_place(centres: Array, axes: Array, position: Array, forward: Array | None) -> int:
-    """The same for a position (3,) and a direction (3,) of unit length; where that is not known, of all references."""
-    distance = np.linalg.norm(centres - position, axis=1)
-    looks = np.zeros(len(axes), bool) if forward is None else axes @ forward > 0.5
-    return int(np.where(looks, distance, np.inf).argmin() if looks.any() else distance.argmin())
-=======
     distance = np.linalg.norm(centres - centre, axis=1)
-    looks = axes @ axis > 0.5
-    if not looks.any():
-        return [int(distance.argmin())]
-    order = np.argsort(np.where(looks, distance, np.inf), kind="stable")[: min(options.places, int(looks.sum()))]
-    return [int(it) for i, it in enumerate(order) if i == 0 or distance[it] <= distance_m]
->>>>>>> cc882bbf (Places need a new survey by photographs of several days and holders, rejections name them, a new survey ends it)
+    order = np.argsort(np.where(axes @ axis > 0.5, distance, np.inf), kind="stable")[: options.places]
+    others = [int(it) for it in order[1:] if axes[it] @ axis > 0.5 and distance[it] <= distance_m]
+    return [nearest_place(centres, axes, centre, axis), *others]
 
 
 def should_show(
