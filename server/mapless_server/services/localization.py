@@ -29,7 +29,6 @@ from mapless_server.scheduling import StageRecord
 from mapless_server.security import NOWHERE, Principal, SceneKey, tenant_of
 from mapless_server.store import SceneAttributes, Store
 
-from .beyond import Asked, may_be_beyond, searched_beyond
 from .capture.calls import Request, Response
 from .capture.recorder import Recorder
 from .finding import SceneFinder
@@ -50,6 +49,7 @@ from .messages.queries import among, query_among, query_from_message
 from .messages.scenes import AskedScenes, allowed_from_message, names_several, questions_from_message
 from .photographs import Joint, localize_group
 from .reach import Reach
+from .rejected import Asked, may_be_beyond, name_outdated_place, searched_beyond
 from .watching import Watcher, Watchers
 
 if TYPE_CHECKING:  # services do not load what computes
@@ -204,8 +204,6 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         """Says in rejections, of scenes that adopt, which place needs a new survey."""
         if response.WhichOneof("outcome") != "rejection" or all(it.attributes.adoption is None for it in results):
             return
-        from .outdated import name_outdated_place  # for these alone
-
         await asyncio.to_thread(name_outdated_place, self._store, response.rejection, results)
 
     async def _debug_of(self, answer: Answer, is_wanted: bool) -> pb.Debug | None:
