@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -47,39 +48,48 @@ def modules_of(package: str) -> dict[str, Path]:
     return {".".join(path.relative_to(base).with_suffix("").parts).removesuffix(".__init__"): path for path in paths}
 
 
+class Import(NamedTuple):
+    """A statement that imports, and whether it is in a function, and for type checkers only."""
+
+    node: ast.Import | ast.ImportFrom
+    is_deferred: bool = False
+    is_for_types: bool = False
+
+
 @cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
+def statements_of(path: Path) -> tuple[Import, ...]:
+    """The imports of a module; without the rest of its tree, which is large."""
+    return tuple(_statements(ast.parse(path.read_text())))
+
+
+def _statements(node: ast.AST, is_deferred: bool = False, is_for_types: bool = False) -> Iterator[Import]:
+    for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+        for child in getattr(node, part, ()):
+            if isinstance(child, ast.Import | ast.ImportFrom):
+                yield Import(child, is_deferred, is_for_types)
+                continue
+            is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef)
+            is_typing = isinstance(child, ast.If) and getattr(child.test, "id", "") == "TYPE_CHECKING"
+            yield from _statements(child, is_deferred or is_function, is_for_types or is_typing)
 
 
 def imports_of(
     module: str, path: Path, known: dict[str, Path], *, deferred: bool, typing: bool = True
 ) -> Iterator[str]:
     """The modules of `known` that a module imports; those in functions if `deferred`, for type checkers if `typing`."""
-    tree = parsed(path)
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(tree) if deferred else _at_import(tree, typing):
+    for node, is_deferred, is_for_types in statements_of(path):
+        if (is_deferred and not deferred) or (is_for_types and not typing):
+            continue
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in known)
-        elif isinstance(node, ast.ImportFrom):
+        else:
             parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
             base = ".".join([*parts, *([node.module] if node.module else [])])
             for alias in node.names:
                 name = f"{base}.{alias.name}"
                 if name in known or base in known:
                     yield name if name in known else base
-
-
-def _at_import(node: ast.AST, typing: bool) -> Iterator[ast.AST]:
-    """The statements that run on import or that a type checker reads: everything outside functions."""
-    for child in ast.iter_child_nodes(node):
-        is_for_types = (
-            isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING"
-        )
-        is_function = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-        if not is_function and (typing or not is_for_types):
-            yield child
-            yield from _at_import(child, typing)
 
 
 @cache
@@ -158,7 +168,7 @@ def test_no_room_inside_method_is_in_a_circle() -> None:
 def test_the_list_of_the_method_is_complete_and_in_order() -> None:
     """Order of a room's modules by its docstring; one on the same line may import the one before it."""
     known = modules_of("mapless_server")
-    text = ast.get_docstring(parsed(known["mapless_server.method"])) or ""
+    text = ast.get_docstring(ast.parse(known["mapless_server.method"].read_text())) or ""
     listed = [name for line in re.findall(r"^([a-z_, /]+?)  ", text, re.MULTILINE) for name in re.findall(r"\w+", line)]
     upward = []
     for module, others in graph("mapless_server", deferred=False).items():
@@ -174,10 +184,10 @@ def packages_of(room: str) -> set[str]:
     """The imports of a room's modules from outside mapless: the first two parts of each name."""
     names: set[str] = set()
     for path in (ROOT / "server" / "mapless_server" / room).rglob("*.py"):
-        for node in ast.walk(parsed(path)):
+        for node, _, _ in statements_of(path):
             if isinstance(node, ast.Import):
                 names |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            elif node.module and not node.level:
                 names.add(node.module)
     return {".".join(name.split(".")[:2]) for name in names}
 
