@@ -79,6 +79,7 @@ def assert_agrees(dataset: Dataset) -> None:
     assert abs(np.median(found) - 1) < 0.05
 
 
+@pytest.mark.nightly
 def test_record3ds_depths_are_those_of_triangulated_points(tmp_path: Path) -> None:
     """The export's own files; their photographs are named in text files where links were not kept."""
     export = DATA / "depth" / "lidar-desk" / "original"

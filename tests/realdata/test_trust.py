@@ -222,6 +222,7 @@ def test_gravity_neither_moves_nor_loses_a_good_answer(photographs: Callable[[st
         assert upside_down.off == none.off
 
 
+@pytest.mark.nightly
 def test_a_weak_answer_gains(photographs: Callable[[str], Dataset]) -> None:
     """No reference within three frames: with gravity more of these photographs are localized."""
     photographs(OFFICE)

@@ -104,8 +104,8 @@ def with_passer_by(frame: Frame, number: int, folder: Path) -> Frame:
 
 
 def test_what_masks_ignore_decides_nothing(tmp_path: Path) -> None:
-    frames = [with_passer_by(it, i, tmp_path) for i, it in enumerate([*STORED[:3], *NEW[:3]])]
-    stored, new = frames[:3], frames[3:]
+    frames = [with_passer_by(it, i, tmp_path) for i, it in enumerate([*STORED[:2], *NEW[:2]])]
+    stored, new = frames[:2], frames[2:]
     unmasked = [replace(it, mask_path=None) for it in new]
     assert checked(Scene(stored=[replace(it, mask_path=None) for it in stored]), unmasked).is_wrong
     scene = Scene(stored=stored)
