@@ -135,6 +135,20 @@ def test_a_moved_thing_takes_no_other_place_along(held: Held) -> None:
     assert held.adopted == []
 
 
+def test_half_of_a_photograph_moved_a_little_is_seen(held: Held) -> None:
+    """By 24 pixels, as where a printed wall hangs beside itself: what does not fit localizes nothing by itself."""
+    here = held.place.queries[1]
+    pixels = _pixels(here)
+    pixels[:, pixels.shape[1] // 2 :] = np.roll(pixels, 24, axis=1)[:, pixels.shape[1] // 2 :]
+    _, jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    candidate = held.candidate(replace(here, data=jpeg.tobytes()))
+    held.adopter._options = AdoptionOptions(min_novelty=0.0)
+    try:
+        assert held.consider(candidate) is Refusal.ELSEWHERE
+    finally:
+        held.adopter._options = None
+
+
 def test_the_least_useful_of_a_full_place_goes_first(held: Held) -> None:
     candidate = held.candidate(held.place.queries[0])
     assert held.consider(candidate) is None

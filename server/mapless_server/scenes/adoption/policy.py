@@ -37,6 +37,7 @@ class AdoptionOptions:
     Attributes:
         min_matches: least matches with surveyed references that agree with the pose from them.
         min_vouchers, voucher_matches: least surveyed references with at least so many such matches.
+        min_rivals: matches with surveyed references that agree on another pose, with which a photograph is not adopted.
         min_novelty: least share of a photograph's keypoints that are not near a match of its answer.
         explained_share: what is so near a match is explained by it, share of the image's longer side.
         first_usefulness: most usefulness of a new reference, so that it cannot at once push out one that proved useful.
@@ -57,6 +58,7 @@ class AdoptionOptions:
     min_matches: int = 30
     min_vouchers: int = 2
     voucher_matches: int = 8
+    min_rivals: int = 30
     min_novelty: float = 0.2
     explained_share: float = 0.04
     first_usefulness: float = 0.2
@@ -72,7 +74,7 @@ class AdoptionOptions:
     contradicting_holders: int = 2
 
     def __post_init__(self) -> None:
-        counts = "min_matches min_vouchers voucher_matches remembered least_photographs photographs_a_day places"
+        counts = "min_matches min_vouchers voucher_matches min_rivals remembered least_photographs photographs_a_day places"
         check_bounds(self, f"{counts} contradictions contradicting_days contradicting_holders", at_least=1)
         check_bounds(self, "min_novelty first_usefulness contradicting_share", at_least=0, at_most=1)
         check_bounds(self, "explained_share same_viewpoint_share", above=0, at_most=1)
@@ -91,7 +93,7 @@ class Refusal(str, Enum):
     DISAGREES = "disagrees"
     """They place it elsewhere than its answer."""
     ELSEWHERE = "elsewhere"
-    """The part that they do not explain shows another place."""
+    """The part that they do not explain shows another place, or as many matches as may vouch agree on another pose."""
     NOTHING_NEW = "nothing_new"
     """It shows nothing that the references lack."""
     PLACE_FULL = "place_full"

@@ -27,7 +27,7 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal
 from mapless_server.store import NewReference, Store, adoption
 
-from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px
+from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px, rival_count
 from .keeping import Keeper
 from .surveyed import Place, SurveyedLocalizer
 from .waiting import Candidate, Waiting
@@ -176,6 +176,8 @@ class Adopter:
         by_all = await asyncio.to_thread(rules.explained, size_px, candidate.inliers_px, options)
         if rules.novelty(keypoints_px(result), by_all) < options.min_novelty:
             return rules.Refusal.NOTHING_NEW
+        if await asyncio.to_thread(rival_count, result) >= options.min_rivals:
+            return rules.Refusal.ELSEWHERE
         ignored = await asyncio.to_thread(self._explained_by, photo, size_px, inliers_px(result), options)
         other = self._localizer.evidence(
             candidate.query, await self._localizer.localized(candidate.query, place.surveyed_ids, ignored)
