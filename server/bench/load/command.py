@@ -106,9 +106,15 @@ def refusals_command(quick: Quick = False, output: Output = OUTPUT) -> None:
     _finish(_refusals(quick, output))
 
 
+@load_app.command("adoption")
+def adoption_command(data: Data = None, quick: Quick = False, output: Output = OUTPUT) -> None:
+    """Measures what adoption costs a query, also while another photograph is being considered."""
+    _finish(_adoption(data, quick, output))
+
+
 @load_app.command("all")
 def all_command(data: Data = None, minutes: Minutes = 10.0, quick: Quick = False, output: Output = OUTPUT) -> None:
-    """All of these but `neighbours`, one after the other."""
+    """All of these but `neighbours` and `adoption`, one after the other."""
     checks = [*_overhead(quick, output), *_refusals(quick, output), *_pipeline(data, quick, output)]
     _finish(checks + _soak(data, quick, output, minutes=minutes))
 
@@ -134,6 +140,23 @@ def _refusals(quick: bool, output: Path) -> list[Check]:
         found = measure_refusals(options, progress)
     checks = refusal_checks(found)
     report_part(output / OUTPUT_FILE, "refusals", refusal_lines(found, options), checks, {"refusals": found})
+    return checks
+
+
+def _adoption(data: Path | None, quick: bool, output: Path) -> list[Check]:
+    from mapless_tools.demo import place_of
+    from mapless_tools.usage import usage_errors
+
+    from .adoption import AdoptionCostOptions, adoption_checks, adoption_lines, measure_adoption
+    from .report import report_part
+
+    options = AdoptionCostOptions(rounds=1) if quick else AdoptionCostOptions()
+    with _measuring() as progress:
+        with usage_errors():
+            place = place_of(data)
+        times = measure_adoption(place, options, progress)
+    checks = adoption_checks(times)
+    report_part(output / OUTPUT_FILE, "adoption", adoption_lines(times), checks, {"times": times})
     return checks
 
 
