@@ -132,14 +132,16 @@ def compared(before: Sequence[Posed], after: Sequence[Posed]) -> tuple[list[floa
     return shifts, lost, gained, (medians[0], medians[1])
 
 
-async def measure(kind: str, photographs: Sequence[Sent], arguments: argparse.Namespace) -> Outcome:
-    """An attack on a fresh server."""
+async def measure(
+    kind: str, photographs: Sequence[Sent], arguments: argparse.Namespace, before: list[Posed]
+) -> Outcome:
+    """An attack on a fresh server; the answers to the views before any attack are added to `before` if it is empty."""
     views = read_folder(arguments.room / "step-00").frames[: arguments.views]
     with tempfile.TemporaryDirectory(prefix="mapless-") as data:
         shutil.copytree(arguments.folder / "surveyed", data, dirs_exist_ok=True)
         async with attacked(Path(data)) as server:
             first = [] if arguments.first is None else await true_ones_first(server, arguments.first)
-            before = await answers(server, views)
+            before.extend([] if before else await answers(server, views))
             reasons, localized, wrong = await attack(server, photographs)
             shifts, lost, gained, off_m = compared(before, await answers(server, views))
             adopted = [it async for it in server.client.list_references(SCENE, only_adopted=True)]
@@ -169,10 +171,11 @@ def main() -> None:
     arguments = parser.parse_args()
     asyncio.run(surveyed(arguments.room / "survey", arguments.folder / "surveyed"))
     renderer, outcomes = Renderer(arguments.folder, arguments.seed), list[Outcome]()
+    before = list[Posed]()
     for kind in arguments.kind:
         photographs = renderer.photographs(kind, arguments.photographs)
-        outcomes.append(asyncio.run(measure(kind, photographs, arguments)))
-        print(outcomes[-1].note(), file=sys.stderr, flush=True)
+        outcomes.append(asyncio.run(measure(kind, photographs, arguments, before)))
+        print(*outcomes[-1].row(), outcomes[-1].note(), sep=" | ", file=sys.stderr, flush=True)
     print("\n".join(markdown_table(HEAD, [it.row() for it in outcomes])), "", sep="\n")
     print("\n".join(it.note() for it in outcomes))
 

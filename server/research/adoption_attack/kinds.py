@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import cv2
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapless.geometry import Array, Camera
 
 from ..rendered_room.furniture import Room
-from ..rendered_room.photographs import QUERY_CAMERA, Station, exposed, phone_settings, photograph, shade
+from ..rendered_room.photographs import QUERY_CAMERA, Floats, Station, exposed, phone_settings, photograph, shade
 from ..rendered_room.renovation import SIZE_PX, Renovation, survey, visit
 from .prints import PICTURE_M, PICTURES_M, pieces_within, print_before, stations, wall_print, with_moved
 
@@ -25,10 +25,10 @@ Pixels = NDArray[np.uint8]
 
 
 class Fake(NamedTuple):
-    """An attacker's photograph (H, W, 3) sRGB, with the station where it was taken, the camera stated, and the day."""
+    """An attacker's photograph: where it was taken, what renders it, (H, W, 3) sRGB, the camera stated, and the day."""
 
     station: Station
-    pixels: Pixels
+    render: Callable[[], Pixels]
     stated: Camera
     day: int = 0
 
@@ -50,10 +50,14 @@ def taken(rooms: Sequence[Room], places: Sequence[Station], count: int, day: int
     each = -(-count // len(places))
     for i, it in enumerate(places):
         finer = it.camera.resized(2 * it.camera.width_px, 2 * it.camera.height_px)
-        light = shade(rooms[i % len(rooms)], finer, it.world_from_camera)
+        light = cache(partial(shade, rooms[i % len(rooms)], finer, it.world_from_camera))
         for k in range(min(each, count - i * each)):
-            random = np.random.default_rng([day, i, k])
-            yield Fake(it, exposed(light, phone_settings(random), random), it.camera, day)
+            yield Fake(it, partial(_exposed, light, [day, i, k]), it.camera, day)
+
+
+def _exposed(light: Callable[[], Floats], seed: Sequence[int]) -> Pixels:
+    random = np.random.default_rng(seed)
+    return exposed(light(), phone_settings(random), random)
 
 
 def places_for(count: int) -> int:
@@ -106,19 +110,18 @@ def _is_behind(corner: Array, sheet: Array) -> bool:
 def edited(rooms: Rooms, count: int, shift_px: int) -> Iterator[Fake]:
     """True photographs of which a half is shifted by so many pixels; 0: has half of another photograph."""
     places = visit(rooms.seed + 50, 0, places_for(count), rooms.surveyed)
-    last: Fake | None = None
-    other: Pixels | None = None
-    for it in taken([rooms.surveyed], places, count):
-        pixels, width = it.pixels.copy(), it.pixels.shape[1]
-        half = slice(width // 2, width)
-        if shift_px:
-            pixels[:, half] = np.roll(it.pixels, shift_px, axis=1)[:, half]
-        else:
-            if last is not None and last.station is not it.station:
-                other = last.pixels
-            pixels[:, half] = (it.pixels[:, ::-1] if other is None else other)[:, half]
-        last = it
-        yield it._replace(pixels=pixels)
+    fakes = list(taken([rooms.surveyed], places, count))
+    for i, it in enumerate(fakes):
+        other = fakes[i - DEVELOPED]  # of another station
+        yield it._replace(render=partial(_with_half, it.render, it.render if shift_px else other.render, shift_px))
+
+
+def _with_half(render: Callable[[], Pixels], render_other: Callable[[], Pixels], shift_px: int) -> Pixels:
+    """A photograph whose right half is that of another one, shifted."""
+    pixels = render().copy()
+    half = slice(pixels.shape[1] // 2, None)
+    pixels[:, half] = np.roll(render_other(), shift_px, axis=1)[:, half]
+    return pixels
 
 
 def reprinted(rooms: Rooms, count: int) -> Iterator[Fake]:
@@ -126,11 +129,13 @@ def reprinted(rooms: Rooms, count: int) -> Iterator[Fake]:
     shown = survey(rooms.seed, rooms.surveyed)
     random = np.random.default_rng([rooms.seed, 12])
     for i, it in enumerate(visit(rooms.seed + 60, 0, count, rooms.foreign)):
-        of, share = shown[i % len(shown)], random.uniform(0.75, 1.1)
-        sheet = print_before(it, of, rooms.surveyed, random.uniform(0.25, 0.5), share)
-        room = rooms.foreign
-        held = Room(room.random, [*room.quads, sheet], room.boxes, room.outline)
-        yield Fake(it, photograph(held, it, 0), CAMERA)
+        of, share, distance_m = shown[i % len(shown)], random.uniform(0.75, 1.1), random.uniform(0.25, 0.5)
+        yield Fake(it, partial(_reprint, rooms, it, of, distance_m, share), CAMERA)
+
+
+def _reprint(rooms: Rooms, station: Station, of: Station, distance_m: float, share: float) -> Pixels:
+    room, sheet = rooms.foreign, print_before(station, of, rooms.surveyed, distance_m, share)
+    return photograph(Room(room.random, [*room.quads, sheet], room.boxes, room.outline), station, 0)
 
 
 def focal(rooms: Rooms, count: int, factor: float) -> Iterator[Fake]:
@@ -151,14 +156,19 @@ def drift(rooms: Rooms, count: int) -> Iterator[Fake]:
 
 def flood(rooms: Rooms, count: int) -> Iterator[Fake]:
     """True photographs with something new pasted into a corner, so that places fill with them."""
-    random = np.random.default_rng([rooms.seed, 13])
-    for it in taken([rooms.surveyed], visit(rooms.seed + 80, 0, places_for(count), rooms.surveyed), count):
-        pixels, (height, width) = it.pixels.copy(), it.pixels.shape[:2]
-        noise = random.integers(0, 255, (height // 16, width // 16, 3), np.uint8)
-        patch = cv2.resize(noise, (width // 2, height // 2), interpolation=cv2.INTER_CUBIC)
-        x, y = random.integers(0, [width // 2, height // 2])
-        pixels[y : y + height // 2, x : x + width // 2] = patch
-        yield it._replace(pixels=pixels)
+    places = visit(rooms.seed + 80, 0, places_for(count), rooms.surveyed)
+    for i, it in enumerate(taken([rooms.surveyed], places, count)):
+        yield it._replace(render=partial(_with_patch, it.render, [rooms.seed, i]))
+
+
+def _with_patch(render: Callable[[], Pixels], seed: Sequence[int]) -> Pixels:
+    random, pixels = np.random.default_rng(seed), render().copy()
+    height, width = pixels.shape[:2]
+    noise = random.integers(0, 255, (height // 16, width // 16, 3), np.uint8)
+    patch = cv2.resize(noise, (width // 2, height // 2), interpolation=cv2.INTER_CUBIC)
+    x, y = random.integers(0, [width // 2, height // 2])
+    pixels[y : y + height // 2, x : x + width // 2] = patch
+    return pixels
 
 
 def true(rooms: Rooms, count: int) -> Iterator[Fake]:

@@ -14,6 +14,8 @@ from mapless.geometry import Camera, RigidTransform
 from ..rendered_room.folders import entry_of
 from .kinds import KINDS, Rooms
 
+QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 92]
+
 
 @dataclass(frozen=True)
 class Sent:
@@ -45,8 +47,9 @@ class Renderer:
         frames = []
         for i, fake in enumerate(KINDS[kind](rooms, count)):
             name = f"{kind}-{i:04d}"
-            pixels = cv2.cvtColor(fake.pixels, cv2.COLOR_RGB2BGR)
-            cv2.imwrite(str(folder / "images" / f"{name}.jpg"), pixels, [cv2.IMWRITE_JPEG_QUALITY, 92])
+            if not (path := folder / "images" / f"{name}.jpg").is_file():  # an earlier run may have been ended
+                _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(fake.render(), cv2.COLOR_RGB2BGR), QUALITY)
+                path.write_bytes(jpeg.tobytes())
             frames.append(entry_of(fake.station._replace(name=name, camera=fake.stated)) | {"day": fake.day})
             if i % 100 == 99:
                 print(f"{kind}: {i + 1} rendered", file=sys.stderr, flush=True)
