@@ -74,8 +74,8 @@ class AdoptionOptions:
     contradicting_holders: int = 2
 
     def __post_init__(self) -> None:
-        counts = "min_matches min_vouchers voucher_matches min_rivals remembered least_photographs photographs_a_day places"
-        check_bounds(self, f"{counts} contradictions contradicting_days contradicting_holders", at_least=1)
+        counts = "min_matches min_vouchers voucher_matches min_rivals remembered least_photographs photographs_a_day"
+        check_bounds(self, f"{counts} places contradictions contradicting_days contradicting_holders", at_least=1)
         check_bounds(self, "min_novelty first_usefulness contradicting_share", at_least=0, at_most=1)
         check_bounds(self, "explained_share same_viewpoint_share", above=0, at_most=1)
         check_bounds(self, "same_viewpoint_deg", above=0, at_most=180)
