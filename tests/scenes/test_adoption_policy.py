@@ -1,4 +1,4 @@
-"""Which localized photographs become references, and when references are retired: decisions on planted values."""
+"""Adoption of localized photographs, and retirement of references: decisions on planted values."""
 
 from collections.abc import Mapping
 
@@ -75,7 +75,7 @@ def test_only_what_looks_about_the_same_way_should_show_it() -> None:
 
 
 def shown(known: Standing, share: float, days: int, *holders: str, each: int = 1) -> Standing:
-    """What is known of a place after photographs on so many further days, `each` of each of these holders."""
+    """The standing of a place after photographs on so many further days, `each` of each of these holders."""
     first = int(known.surveyed_by[-1].partition(":")[0]) + 1 if known.surveyed_by else 10_000
     for day in range(first, first + days):
         for holder in holders * each:
@@ -131,7 +131,7 @@ def test_a_photograph_counts_for_the_places_around_it() -> None:
 
 
 def contradicted(days: int, *holders: str, each: int = 1) -> Standing:
-    """What is known after photographs on so many days, `each` of each of these holders."""
+    """The standing after photographs on so many days, `each` of each of these holders."""
     known = Standing()
     for photograph in range(days * each):
         now_us = 10**15 + photograph // each * rules.DAY_US

@@ -73,7 +73,7 @@ class Indexes:
         return self.entries()
 
     def found(self) -> list[list[tuple[str, str]]]:
-        """What all photographs find, and every reference by its id and key."""
+        """The references that all photographs find, and every reference by its id and key."""
 
         def find() -> list[list[tuple[str, str]]]:
             entries = self.entries()
@@ -285,7 +285,7 @@ class TestUse:
 class TestDistrust:
     @pytest.mark.parametrize("part", PARTS)
     def test_a_changed_byte_anywhere_is_found(self, serve: Serve, store: Store, tmp_path: Path, part: str) -> None:
-        """Of the file while a server uses it, and before it starts; either way it answers, and makes the file again."""
+        """While a server uses the file, and before it starts; either way it answers, and makes the file again."""
         damage(store, SCENE, "r9", "descriptor")  # so that every part has bytes
         indexes = serve()
         indexes.filed()

@@ -98,7 +98,7 @@ def at_place(key: str, outcomes: Iterable[tuple[int, str, int]]) -> dict[CountKe
 
 
 def test_the_place_that_lacks_references_is_suggested_first() -> None:
-    """What is localized nearly always needs none, bad photographs are not rescued, and old ones count less."""
+    """A place that is nearly always localized needs none, none rescues bad photographs, and old ones count less."""
     planted = {
         "corner": at_place("corner", [(0, LOW, 6), (1, GATE, 3), (0, LOCALIZED, 1)]),
         "covered": at_place("covered", [(0, LOW, 12), (0, LOCALIZED, 400)]),

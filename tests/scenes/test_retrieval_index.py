@@ -227,7 +227,7 @@ def test_memory_follows_what_is_held() -> None:
 
 
 class TestFiles:
-    """What a file adds."""
+    """An index with a file, compared with one without."""
 
     @staticmethod
     def places(count: int) -> tuple[list[IndexedReference], list[NDArray[np.float32]]]:

@@ -41,7 +41,7 @@ class Held:
     loop: asyncio.AbstractEventLoop
 
     def candidate(self, photograph: Photograph) -> Candidate:
-        """What is left of a photograph after it was answered."""
+        """A photograph that was answered, as it waits to be considered."""
         answer = self.client.localize(photograph.data, photograph.camera, "room", allow_adoption=True)
         assert not isinstance(answer, Rejected)
         candidate = self.adopter._waiting.pop()

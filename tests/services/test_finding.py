@@ -1,4 +1,4 @@
-"""What is kept of groups of scenes that callers name: no more than scenes that exist account for."""
+"""Groups of scenes that callers name: no more is kept of them than scenes that exist account for."""
 
 from pathlib import Path
 

@@ -22,7 +22,7 @@ DOWN = SceneAttributes(down_in_world=(0.0, 0.0, -1.0))
 
 @contextmanager
 def statements(store: Store) -> Iterator[list[str]]:
-    """What is selected in the block."""
+    """The statements that select scenes in the block."""
     found: list[str] = []
     with store.database.read() as connection:
         engine = connection.engine

@@ -149,7 +149,7 @@ def test_a_scene_with_too_little_is_refused(
 
 
 def test_adopted_references_place_nothing(server: RunningServer, client: Client, photos: Path) -> None:
-    """Of two references one is adopted, which leaves too few."""
+    """One of two references is adopted, which leaves too few."""
     name = f"adopted-{time.monotonic_ns()}"
     client.create_scene(name)
     first, second = (half(it).reference() for it in REFERENCES[:2])

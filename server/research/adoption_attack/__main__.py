@@ -39,7 +39,7 @@ HEAD = "kind | sent | localized | wrong | considered | refused | adopted | off a
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of an attack.
+    """The outcome of an attack.
 
     Attributes:
         kind, sent, localized: the attack, photographs, and those with an answer.

@@ -20,7 +20,7 @@ CAMERA = QUERY_CAMERA.resized(*SIZE_PX)
 DEVELOPED = 5
 """Photographs of each station: the attacker's phone exposes them differently."""
 DAYS = 20
-"""Of the slow attack; on each the pictures hang 2 cm further."""
+"""Days of the slow attack; on each the pictures hang 2 cm further."""
 Pixels = NDArray[np.uint8]
 
 

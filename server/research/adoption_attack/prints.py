@@ -79,7 +79,7 @@ def wall_print(room: Room, low: Array, high: Array, texels_per_m: float, move_m:
 
 
 def print_before(station: Station, of: Station, room: Room, distance_m: float, share: float) -> Quad:
-    """What a station sees, printed and held before a camera so that it fills this share of each of its sides."""
+    """A station's view, printed and held before a camera so that it fills this share of each of its sides."""
     light = shade(room, of.camera.resized(1280, 960), of.world_from_camera)
     pose, camera = station.world_from_camera, station.camera
     corners_px = np.array([[0, 0], [camera.width_px, 0], [0, camera.height_px]], float)

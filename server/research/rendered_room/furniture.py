@@ -20,7 +20,7 @@ from .textures import Image, Random, Texture
 
 ROOM_M = np.array([5.0, 4.0, 2.6])
 LOWEST_CAMERA_M = 0.85
-"""What stands lower has no bottom."""
+"""Furniture that stands lower has no bottom."""
 FACES = {
     "front": ((0, 0, 1), (1, 0, 0), (0, 0, -1)),
     "right": ((1, 0, 1), (0, 1, 0), (0, 0, -1)),

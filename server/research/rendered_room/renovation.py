@@ -36,7 +36,7 @@ class RenovatedRoom(Room):
         super().__init__(np.random.default_rng([seed, 0]))
         self._known = known
         self.versions: list[tuple[int, int]] = []
-        """Of each rectangle: its number, and how often it was exchanged."""
+        """Number of each rectangle, and how often it was exchanged."""
         self._seed, self._step = seed, step
         self._piece = 0
         self._in_box = False
