@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from .diagnostics import Debug, Diagnostics, summary_of_missing
+from .diagnostics import ADOPTION_OFFERS, Debug, Diagnostics, summary_of_missing
 from .geodesy import GeoPose
 from .geometry import Array, RigidTransform
 from .used_intrinsics import IntrinsicsCheck, UsedIntrinsics
@@ -228,6 +228,7 @@ class LocalizationResult:
             points = ", ".join(f"{count} {POINT_SOURCES.get(it, it)}" for it, count in counts.items() if count)
             text.append(f"  points    {points}")
         text += [f"  depth     {it}" for it in (self.diagnostics.depth_check,) if it is not None]
+        text += [f"  adoption  {ADOPTION_OFFERS.get(it, it)}" for it in (self.diagnostics.adoption,) if it]
         text += [f"  cut       {it}" for it in self.diagnostics.ladder_cuts]
         if self.diagnostics.ladder_cuts or (self.trust is not None and self.trust < DOUBTFUL_TRUST):
             text += [f"  missing   {it}" for it in _missing(self.diagnostics)]

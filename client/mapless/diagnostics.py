@@ -207,6 +207,18 @@ class DepthCheck:
         return f"{self.agreeing_count} of {self.compared_count} agree, {factor}: {outcome}"
 
 
+ADOPTION_OFFERS = {
+    "WAITING": "may become a reference, once the server has time to consider it",
+    "SCENE_ADOPTS_NOTHING": "not kept: the scene adopts nothing",
+    "CONFIDENTIAL": "not kept: the call is confidential",
+    "REFERENCES_NAMED": "not kept: the call names references",
+    "NOT_LOCALIZED": "not kept: it is not localized alone",
+    "UNCERTAIN": "not kept: it is less certain than the scene's policy asks for",
+    "QUEUE_FULL": "not kept: too many photographs wait to be considered",
+}
+"""Sentences about a photograph whose call allows adoption."""
+
+
 @dataclass(frozen=True)
 class Diagnostics:
     """Data and software that an answer was computed from, and the time it took.
@@ -233,6 +245,8 @@ class Diagnostics:
         scenes: of several scenes, those with references that resemble the photograph most, the best first, by
             their agreement.
         searched_scene_count: number of scenes in which references were looked for; 0 of a server before 0.4.
+        adoption: what became of `allow_adoption`, a key of `ADOPTION_OFFERS` such as "WAITING"; empty where it was not
+            set, and from a server before 0.4.
     """
 
     request_id: str
@@ -259,6 +273,7 @@ class Diagnostics:
     missing_evidence: tuple[MissingEvidence, ...] = ()
     scenes: tuple[SceneUse, ...] = ()
     searched_scene_count: int = 0
+    adoption: str = ""
 
     @property
     def is_among_several(self) -> bool:

@@ -120,6 +120,9 @@ def _attempt(message: pb.Attempt, path: str) -> Attempt:
     return read(Attempt, message, path, **times)
 
 
+_OFFER: wire.ProtoEnum = pb.AdoptionOffer
+
+
 def _diagnostics(message: pb.Diagnostics, path: str) -> Diagnostics:
     stage_s = {timing.stage: _seconds(timing.duration) for timing in message.stages}
     times = {
@@ -127,7 +130,8 @@ def _diagnostics(message: pb.Diagnostics, path: str) -> Diagnostics:
         "total_s": _seconds(message.total_duration),
         "processor_s": _seconds(message.processor_duration),
     }
-    return read(Diagnostics, message, path, stage_s=stage_s, **times)
+    adoption = wire.value_name(_OFFER.DESCRIPTOR, message.adoption) if message.adoption else ""
+    return read(Diagnostics, message, path, stage_s=stage_s, adoption=adoption, **times)
 
 
 def _seconds(duration: Any) -> float:

@@ -13,10 +13,11 @@ import pytest
 from numpy.typing import NDArray
 from support.servers import listening
 
-from mapless import AdoptionPolicy, Client, NewReference, Rejected
+from mapless import AdoptionPolicy, Client, NewReference, Rejected, RigImage, SequenceFrame
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Refusal
 from mapless_server.security import SceneKey
 from mapless_server.serve.adoption import adopter as module
+from mapless_server.serve.adoption import waiting
 from mapless_server.serve.adoption.adopter import Adopter
 from mapless_server.serve.adoption.waiting import Candidate
 from mapless_server.serve.opening import make_engine
@@ -44,7 +45,11 @@ class Held:
         """A photograph that was answered, as it waits to be considered."""
         answer = self.client.localize(photograph.data, photograph.camera, "room", allow_adoption=True)
         assert not isinstance(answer, Rejected)
-        candidate = self.adopter._waiting.pop()
+        return self.taken()
+
+    def taken(self) -> Candidate:
+        """The photograph that has waited longest to be considered."""
+        candidate = self.adopter.take()
         assert candidate is not None
         return candidate
 
@@ -281,3 +286,93 @@ def test_only_what_was_compared_is_contradicted(held: Held) -> None:
     finally:
         held.adopter._options = None
     assert [it.reference_id for it in held.client.list_references("room", only_retired=True)] == ["changed"]
+
+
+def test_among_several_scenes_the_one_of_the_answer_adopts(held: Held) -> None:
+    query = held.place.queries[0]
+    held.client.create_scene("elsewhere", adoption=POLICY)
+    held.client.add_references("elsewhere", [NewReference("other", _noise(), query.camera, query.world_from_camera)])
+    try:
+        answer = held.client.localize(
+            query.data, query.camera, scenes=["elsewhere", "room"], allow_adoption=True, axes="opencv"
+        )
+        assert (answer.scene, answer.diagnostics.adoption) == ("scenes/room", "WAITING")
+        assert held.consider(held.taken()) is None
+        assert len(held.adopted) == 1
+        assert list(held.client.list_references("elsewhere", only_adopted=True)) == []
+    finally:
+        held.client.delete_scene("elsewhere")
+
+
+@pytest.mark.parametrize("is_rig", [True, False], ids=["rig", "sequence"])
+def test_each_photograph_of_a_group_may_be_adopted(held: Held, is_rig: bool) -> None:
+    queries = held.place.queries[0], held.place.queries[4]
+    first = queries[0].world_from_camera.inverse()
+    poses = [first.compose(it.world_from_camera) for it in queries]
+    both = list(zip(queries, poses, strict=True))
+    rig = [RigImage(it.data, it.camera, pose) for it, pose in both]
+    frames = [SequenceFrame(it.data, it.camera, pose) for it, pose in both]
+    client = held.client
+    answer = (
+        client.localize_rig(rig, "room", allow_adoption=True)
+        if is_rig
+        else client.localize_sequence(frames, "room", allow_adoption=True)
+    )
+    assert [it.diagnostics.adoption for it in answer.images] == ["WAITING", "WAITING"]
+    assert [held.consider(held.taken()) for _ in both] == [None, None]
+    kept = [held.client.get_reference("room", it, include_image=True) for it in held.adopted]
+    assert {it.image for it in kept} == {it.data for it in queries}
+    for query in queries:
+        (own,) = (it for it in kept if it.image == query.data)
+        error_m, _ = pose_error(query.world_from_camera, own.world_from_camera)
+        assert own.provenance.accuracy is not None
+        assert error_m <= own.provenance.accuracy.position_95_m
+
+
+def test_an_estimated_camera_is_kept_with_its_reference(held: Held) -> None:
+    query = held.place.queries[0]
+    given, found = (held.client.localize(query.data, it, "room", allow_adoption=True) for it in (query.camera, None))
+    assert not isinstance(found, Rejected)
+    assert found.diagnostics.adoption == "WAITING"
+    candidates = held.taken(), held.taken()
+    assert found.used_intrinsics is not None
+    assert held.consider(candidates[1]) is None
+    (adopted,) = held.client.list_references("room", only_adopted=True)
+    assert adopted.camera == found.used_intrinsics.camera
+    error_m, _ = pose_error(query.world_from_camera, adopted.world_from_camera)
+    assert adopted.provenance.accuracy is not None
+    assert error_m <= adopted.provenance.accuracy.position_95_m
+    assert not isinstance(given, Rejected)
+
+
+def test_a_camera_that_is_known_too_little_keeps_nothing(held: Held) -> None:
+    query = held.place.queries[0]
+    held.client.update_scene("room", adoption=replace(POLICY, max_radius_m=0.002))
+    answer = held.client.localize(query.data, None, "room", allow_adoption=True)
+    assert answer.diagnostics.adoption == "UNCERTAIN"
+
+
+def test_an_answer_says_why_nothing_is_kept(held: Held, monkeypatch: pytest.MonkeyPatch) -> None:
+    query, client = held.place.queries[0], held.client
+    ask = partial(client.localize, query.data, query.camera, "room", allow_adoption=True)
+
+    def said(**flags: object) -> str:
+        return ask(**flags).diagnostics.adoption  # type: ignore[arg-type]
+
+    assert client.localize(query.data, query.camera, "room").diagnostics.adoption == ""
+    assert said(confidential=True) == "CONFIDENTIAL"
+    assert said(references=[it.name for it in held.place.references[::2]]) == "REFERENCES_NAMED"
+    assert client.localize(_noise(), query.camera, "room", allow_adoption=True).diagnostics.adoption == "NOT_LOCALIZED"
+    client.update_scene("room", adoption=replace(POLICY, max_radius_m=1e-5))
+    assert said() == "UNCERTAIN"
+    client.update_scene("room", adoption=None)
+    assert said() == "SCENE_ADOPTS_NOTHING"
+    client.update_scene("room", adoption=POLICY)
+    monkeypatch.setattr(waiting, "MAX_WAITING", 0)
+    assert said() == "QUEUE_FULL"
+    assert held.adopter.take() is None
+
+
+def _noise() -> bytes:
+    noise = np.random.default_rng(1).integers(0, 255, (720, 960, 3), np.uint8)
+    return bytes(cv2.imencode(".png", noise)[1].tobytes())

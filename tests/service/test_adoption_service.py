@@ -152,16 +152,14 @@ def test_places_that_need_a_new_survey_are_named(client: Client, server: Running
         {},
         {"allow_adoption": True, "confidential": True},
         {"allow_adoption": True, "references": ["r0"]},
-        {"allow_adoption": True, "camera": None},
     ],
-    ids=["absent", "confidential", "named references", "no intrinsics"],
+    ids=["absent", "confidential", "named references"],
 )
 def test_nothing_is_considered_that_the_request_forbids(
     client: Client, server: RunningServer, adopting: str, asked: dict[str, object]
 ) -> None:
     before = server.value("mapless_adoptions_total")
-    camera = asked.pop("camera", CAMERA)
-    client.localize(PHOTO, camera, adopting, **asked)  # type: ignore[arg-type]
+    client.localize(PHOTO, CAMERA, adopting, **asked)  # type: ignore[arg-type]
     assert server.value("mapless_adoptions_total") == before
 
 

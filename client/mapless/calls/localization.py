@@ -244,6 +244,7 @@ async def localize_rig(
     reference_count: int = 0,
     coverage: float = 0.0,
     confidential: bool = False,
+    allow_adoption: bool = False,
     include_imprecise_pose: bool = False,
     capture_time: datetime | None = None,
     session_from_rig: RigidTransform | None = None,
@@ -262,6 +263,7 @@ async def localize_rig(
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
         confidential: see `localize`.
+        allow_adoption: see `localize`; concerns photographs that are localized alone, see `ImageReport.diagnostics`.
         include_imprecise_pose: see `localize`; concerns `ImageReport.hypotheses_alone`.
         capture_time: time of the photographs, with time zone; returned with the answer.
         session_from_rig: the device's own pose of the rig at that time, OpenCV's axes; used for
@@ -277,6 +279,7 @@ async def localize_rig(
             reference_count=reference_count,
             coverage=coverage,
             confidential=confidential,
+            allow_adoption=allow_adoption,
             include_imprecise_pose=include_imprecise_pose,
         ),
     )
@@ -302,6 +305,7 @@ async def localize_sequence(
     reference_count: int = 0,
     coverage: float = 0.0,
     confidential: bool = False,
+    allow_adoption: bool = False,
     include_imprecise_pose: bool = False,
     axes: Axes | str = "",
     timeout_s: float | None = None,
@@ -321,6 +325,7 @@ async def localize_sequence(
         reference_count: number of references that the server chooses for each photograph; 0 for its default.
         coverage: see `localize`; holds for the joint pose, and for each photograph alone.
         confidential: see `localize`.
+        allow_adoption: see `localize`; concerns photographs that are localized alone, see `ImageReport.diagnostics`.
         include_imprecise_pose: see `localize`; concerns `ImageReport.hypotheses_alone`.
         axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: the axes of the device's poses
             and of `SequenceLocalization.world_from_session`.
@@ -335,6 +340,7 @@ async def localize_sequence(
             reference_count=reference_count,
             coverage=coverage,
             confidential=confidential,
+            allow_adoption=allow_adoption,
             include_imprecise_pose=include_imprecise_pose,
             axes=wire.enum_value(pb.Axes, axes),
         ),

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from ..answers import LocalizationResult, Rejected
+from ..diagnostics import ADOPTION_OFFERS
 from ..errors import MaplessError, ResourceExhausted
 from ..options import ConnectOptions
 from .waiting import WaitingClient
@@ -78,6 +79,7 @@ class Tally:
         self._counts: Counter[str] = Counter()
         self._reasons: dict[str, Counter[str]] = {NOT_LOCALIZED: Counter(), FAILED: Counter()}
         self._captured = 0
+        self._offers: Counter[str] = Counter()
         self._is_drawn = sys.stderr.isatty()
         self._start_s = time.monotonic()
         self._drawn_s = 0.0
@@ -90,7 +92,9 @@ class Tally:
             self._reasons[kind][outcome.reason] += 1
         self.done += 1
         self._counts[kind] += 1
-        self._captured += not isinstance(outcome, MaplessError) and outcome.diagnostics.captured
+        if not isinstance(outcome, MaplessError):
+            self._captured += outcome.diagnostics.captured
+            self._offers.update([outcome.diagnostics.adoption] if outcome.diagnostics.adoption else [])
         if time.monotonic() - self._drawn_s >= _REDRAW_S or self.done == self._total:
             self.draw()
 
@@ -109,7 +113,9 @@ class Tally:
             if reasons:
                 why = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
                 text += f", {self._counts[kind]} {kind} ({why})"
-        return text + (f"; {self._captured} captured by the server" if self._captured else "")
+        text += f"; {self._captured} captured by the server" if self._captured else ""
+        offers = "".join(f"; {count} {ADOPTION_OFFERS.get(it, it)}" for it, count in self._offers.most_common())
+        return text + offers
 
     def progress(self) -> str:
         """The progress bar: "[######......] 4/8, 1 not localized, 1 failed, 3 s to go"."""

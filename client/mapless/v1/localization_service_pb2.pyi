@@ -113,6 +113,17 @@ class RejectionReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     REJECTION_REASON_AMBIGUOUS: _ClassVar[RejectionReason]
     REJECTION_REASON_PRIOR_CONFLICT: _ClassVar[RejectionReason]
 
+class AdoptionOffer(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    ADOPTION_OFFER_UNSPECIFIED: _ClassVar[AdoptionOffer]
+    ADOPTION_OFFER_WAITING: _ClassVar[AdoptionOffer]
+    ADOPTION_OFFER_SCENE_ADOPTS_NOTHING: _ClassVar[AdoptionOffer]
+    ADOPTION_OFFER_CONFIDENTIAL: _ClassVar[AdoptionOffer]
+    ADOPTION_OFFER_REFERENCES_NAMED: _ClassVar[AdoptionOffer]
+    ADOPTION_OFFER_NOT_LOCALIZED: _ClassVar[AdoptionOffer]
+    ADOPTION_OFFER_UNCERTAIN: _ClassVar[AdoptionOffer]
+    ADOPTION_OFFER_QUEUE_FULL: _ClassVar[AdoptionOffer]
+
 class LadderCutReason(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     LADDER_CUT_REASON_UNSPECIFIED: _ClassVar[LadderCutReason]
@@ -206,6 +217,14 @@ REJECTION_REASON_PNP_FAILED: RejectionReason
 REJECTION_REASON_GATE: RejectionReason
 REJECTION_REASON_AMBIGUOUS: RejectionReason
 REJECTION_REASON_PRIOR_CONFLICT: RejectionReason
+ADOPTION_OFFER_UNSPECIFIED: AdoptionOffer
+ADOPTION_OFFER_WAITING: AdoptionOffer
+ADOPTION_OFFER_SCENE_ADOPTS_NOTHING: AdoptionOffer
+ADOPTION_OFFER_CONFIDENTIAL: AdoptionOffer
+ADOPTION_OFFER_REFERENCES_NAMED: AdoptionOffer
+ADOPTION_OFFER_NOT_LOCALIZED: AdoptionOffer
+ADOPTION_OFFER_UNCERTAIN: AdoptionOffer
+ADOPTION_OFFER_QUEUE_FULL: AdoptionOffer
 LADDER_CUT_REASON_UNSPECIFIED: LadderCutReason
 LADDER_CUT_REASON_NO_TIME: LadderCutReason
 LADDER_CUT_REASON_CALLER_FAILS: LadderCutReason
@@ -598,7 +617,7 @@ class Hypothesis(_message.Message):
     def __init__(self, world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., inlier_count: _Optional[int] = ..., references: _Optional[_Iterable[str]] = ..., covariance: _Optional[_Union[PoseCovariance, _Mapping]] = ..., accuracy: _Optional[_Union[Accuracy, _Mapping]] = ..., arbitrary_unit: bool = ..., in_axes: _Optional[_Union[FramedPose, _Mapping]] = ..., geo_pose: _Optional[_Union[GeoPose, _Mapping]] = ..., scene: _Optional[str] = ...) -> None: ...
 
 class Diagnostics(_message.Message):
-    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "attempts", "stationary_keypoint_count", "ladder_cuts", "depth_check", "missing_evidence", "scenes", "searched_scene_count")
+    __slots__ = ("request_id", "backend", "weights_sha256", "features", "variant", "store_generation", "references", "scale", "stages", "queue_duration", "total_duration", "processed_width_px", "processed_height_px", "server_version", "retrieval", "captured", "processor_duration", "attempts", "stationary_keypoint_count", "ladder_cuts", "depth_check", "missing_evidence", "scenes", "searched_scene_count", "adoption")
     REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     BACKEND_FIELD_NUMBER: _ClassVar[int]
     WEIGHTS_SHA256_FIELD_NUMBER: _ClassVar[int]
@@ -623,6 +642,7 @@ class Diagnostics(_message.Message):
     MISSING_EVIDENCE_FIELD_NUMBER: _ClassVar[int]
     SCENES_FIELD_NUMBER: _ClassVar[int]
     SEARCHED_SCENE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    ADOPTION_FIELD_NUMBER: _ClassVar[int]
     request_id: str
     backend: str
     weights_sha256: str
@@ -647,7 +667,8 @@ class Diagnostics(_message.Message):
     missing_evidence: _containers.RepeatedCompositeFieldContainer[MissingEvidence]
     scenes: _containers.RepeatedCompositeFieldContainer[SceneUse]
     searched_scene_count: int
-    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ..., ladder_cuts: _Optional[_Iterable[_Union[LadderCut, _Mapping]]] = ..., depth_check: _Optional[_Union[DepthCheck, _Mapping]] = ..., missing_evidence: _Optional[_Iterable[_Union[MissingEvidence, _Mapping]]] = ..., scenes: _Optional[_Iterable[_Union[SceneUse, _Mapping]]] = ..., searched_scene_count: _Optional[int] = ...) -> None: ...
+    adoption: AdoptionOffer
+    def __init__(self, request_id: _Optional[str] = ..., backend: _Optional[str] = ..., weights_sha256: _Optional[str] = ..., features: _Optional[str] = ..., variant: _Optional[_Union[Variant, str]] = ..., store_generation: _Optional[int] = ..., references: _Optional[_Iterable[_Union[ReferenceUse, _Mapping]]] = ..., scale: _Optional[_Union[ScaleEstimate, _Mapping]] = ..., stages: _Optional[_Iterable[_Union[StageTiming, _Mapping]]] = ..., queue_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., total_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., processed_width_px: _Optional[int] = ..., processed_height_px: _Optional[int] = ..., server_version: _Optional[str] = ..., retrieval: _Optional[str] = ..., captured: bool = ..., processor_duration: _Optional[_Union[_duration_pb2.Duration, _Mapping]] = ..., attempts: _Optional[_Iterable[_Union[Attempt, _Mapping]]] = ..., stationary_keypoint_count: _Optional[int] = ..., ladder_cuts: _Optional[_Iterable[_Union[LadderCut, _Mapping]]] = ..., depth_check: _Optional[_Union[DepthCheck, _Mapping]] = ..., missing_evidence: _Optional[_Iterable[_Union[MissingEvidence, _Mapping]]] = ..., scenes: _Optional[_Iterable[_Union[SceneUse, _Mapping]]] = ..., searched_scene_count: _Optional[int] = ..., adoption: _Optional[_Union[AdoptionOffer, str]] = ...) -> None: ...
 
 class SceneUse(_message.Message):
     __slots__ = ("scene", "reference_count", "similarity", "match_count", "attempted", "agreement")

@@ -58,8 +58,8 @@ if TYPE_CHECKING:  # services do not load what computes
 GiveBetter = Callable[[pb.LocalizeResponse], None]
 """Receives an answer that is better than those before, while the final one is computed."""
 
-Offer = Callable[[pb.LocalizeRequest, pb.LocalizeResponse, Query, Result, Principal], None]
-"""Receives a request, its answer and its caller, which may become a reference; must return at once."""
+Offer = Callable[[pb.LocalizeOptions, Query, Result, Principal], pb.AdoptionOffer]
+"""Receives an answered photograph, which may become a reference, and its caller; returns at once what becomes of it."""
 
 Count = Callable[[Sequence[tuple[Query, Result]], Any, Any], None]
 """Receives answered photographs, the outcome of their call and the message of its pose, to be counted; at once."""
@@ -89,7 +89,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._watchers = watchers
         self._recorder = recorder
         self.offer: Offer | None = None
-        """Receives each answer to a single photograph, once it is made; None before the server serves."""
+        """Receives each answer whose call allows adoption; None before the server serves."""
         self.count: Count | None = None
         """Receives the photographs of each answer that is not confidential; None where they are not counted."""
 
@@ -191,13 +191,13 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         debug = await self._debug_of(answer, request.options.include_debug or is_watched)
         if request.options.include_debug and debug is not None:
             response.debug.CopyFrom(debug)
+        if self.offer is not None and request.options.allow_adoption:
+            response.diagnostics.adoption = self.offer(request.options, query, result, call.principal)
         prior_attributes = await self._prior_attributes(request, response.scene, call)
         self._capture(request, response, call, [(query, result)], prior_attributes)
         if not request.options.confidential:
             self._watchers.publish(result.scene_key, request, response, debug)
         self._count_photographs(request, [(query, result)], answer.outcome, response.localization)
-        if self.offer is not None:
-            self.offer(request, response, query, result, call.principal)
         return response
 
     async def _name_outdated(self, response: Any, results: Sequence[Result]) -> None:
@@ -316,6 +316,11 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     ) -> None:
         for report in response.images:
             report.diagnostics.request_id = call.request_id
+        is_posed, not_posed = not isinstance(outcome, Rejection), pb.ADOPTION_OFFER_NOT_LOCALIZED
+        if self.offer is not None and request.options.allow_adoption:
+            for report, query, result in zip(response.images, queries, results, strict=True):
+                offered = self.offer(request.options, query, result, call.principal) if is_posed else not_posed
+                report.diagnostics.adoption = offered
         call.note(localized_alone=sum(not report.HasField("alone") for report in response.images))
         self._report(outcome, response.localization, results, call)
         parts = list(zip(queries, results, strict=True))

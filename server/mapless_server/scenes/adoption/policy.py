@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.geometry import Array, RigidTransform, rotation_angle_deg
+from mapless.geometry import Array, Camera, RigidTransform, rotation_angle_deg
 from mapless.scenes import AdoptionPolicy
 from mapless_server.bounds import check_bounds
 from mapless_server.security import Principal, Role
@@ -137,6 +137,15 @@ class Evidence:
 def is_certain(policy: AdoptionPolicy, found: Evidence) -> bool:
     """Whether an answer reaches the trust and the radius of a scene's policy."""
     return found.trust >= policy.min_trust and found.position_68_m <= policy.max_radius_m
+
+
+def camera_error_m(camera: Camera, focal_share: float, distance_m: float) -> float:
+    """How far a camera displaces what its corners show at this distance, by one standard deviation of its focal length.
+
+    `focal_share` is that, as a share of the focal length.
+    """
+    corner_px = math.hypot(camera.width_px, camera.height_px) / 2
+    return focal_share * distance_m * corner_px / camera.focal_x_px
 
 
 def surveyed_share(answered: Evidence, surveyed: Evidence | None) -> float:

@@ -10,7 +10,6 @@ import hashlib
 import logging
 import time
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
 from datetime import datetime, timezone
 
 from mapless.answers import Accuracy
@@ -21,13 +20,14 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.query import Photo, Query, Result
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.errors import AlreadyExists, RequestError
+from mapless_server.method.judge.answer import Localization
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal
 from mapless_server.store import NewReference, Store, adoption
 
-from .evidence import distance_shown, evidence_of, inliers_px, keypoints_px, rival_count
+from .evidence import distance_shown, inliers_px, kept_query, keypoints_px, rival_count
 from .keeping import Keeper
 from .surveyed import Place, SurveyedLocalizer
 from .waiting import Candidate, Waiting
@@ -68,28 +68,28 @@ class Adopter:
         self._localizer = SurveyedLocalizer(engine, store)
         self._keeper = Keeper(engine, store, observer, self._localizer, hours)
 
-    def offer(
-        self,
-        request: pb.LocalizeRequest,
-        response: pb.LocalizeResponse,
-        query: Query,
-        result: Result,
-        principal: Principal,
-    ) -> None:
-        """Remembers an answered photograph that may be adopted; called on the event loop, after the answer is made."""
-        policy, asked = result.attributes.adoption, request.options
-        if policy is None or not asked.allow_adoption or asked.confidential or query.reference_ids or query.scenes:
-            return
-        if query.photo.exif is not None:  # its camera is a guess
-            return
-        evidence = evidence_of(response, result)
-        if evidence is None or evidence.trust < policy.min_trust or evidence.position_68_m > policy.max_radius_m:
+    def offer(self, asked: pb.LocalizeOptions, query: Query, result: Result, principal: Principal) -> pb.AdoptionOffer:
+        """Remembers an answered photograph whose call allows adoption, if it may be adopted; says why not.
+
+        Called on the event loop, after the answer is made; it takes microseconds.
+        """
+        policy = result.attributes.adoption
+        if asked.confidential:
+            return pb.ADOPTION_OFFER_CONFIDENTIAL
+        if query.reference_ids:
+            return pb.ADOPTION_OFFER_REFERENCES_NAMED
+        if not isinstance(result.answer.outcome, Localization) or result.scene_key is None:
+            return pb.ADOPTION_OFFER_NOT_LOCALIZED
+        if policy is None:
+            return pb.ADOPTION_OFFER_SCENE_ADOPTS_NOTHING
+        evidence, kept = self._localizer.evidence(query, result), kept_query(query, result, policy)
+        if evidence is None or kept is None or not rules.is_certain(policy, evidence):
             self._observer.count("adoptions", 1, "uncertain")
-            return
-        kept = replace(query, photo=replace(query.photo, depth=None))
+            return pb.ADOPTION_OFFER_UNCERTAIN
         holder, now_s = rules.holder_of(principal), time.monotonic()
-        left = self._waiting.add(Candidate(kept, evidence, inliers_px(result), distance_shown(result), holder, now_s))
-        self._observer.count("adoptions", left, "queue")
+        candidate = Candidate(kept, evidence, inliers_px(result), distance_shown(result), holder, now_s)
+        self._observer.count("adoptions", self._waiting.add(candidate), "queue")
+        return pb.ADOPTION_OFFER_WAITING if candidate in self._waiting else pb.ADOPTION_OFFER_QUEUE_FULL
 
     async def run(self) -> None:
         """Considers what is offered until it is cancelled; each failure is logged and counted, and ends nothing.

@@ -1,15 +1,20 @@
 """The part of an answer that adoption uses: its pose, radii and matches."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from mapless.geometry import Array
 from mapless.names import parse_reference_name
+from mapless.scenes import AdoptionPolicy
 from mapless.v1 import localization_service_pb2 as pb
-from mapless_server.engine.query import Result
+from mapless_server.engine.group_cameras import read_with
+from mapless_server.engine.query import Query, Result
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.pose.pnp import MIN_MATCHES, PnpOptions, ransac
-from mapless_server.scenes.adoption.policy import Evidence
+from mapless_server.scenes.adoption.policy import Evidence, camera_error_m
+from mapless_server.services.messages.answers import used_camera
 from mapless_server.services.messages.debug import sent_pixels
 
 RIVALS = PnpOptions(max_iterations=2000)
@@ -35,6 +40,22 @@ def evidence_of(response: pb.LocalizeResponse, result: Result) -> Evidence | Non
         {name: count for name, count in counts if count},
         np.reshape(localization.covariance.row_major, (6, 6)),
     )
+
+
+def kept_query(query: Query, result: Result, policy: AdoptionPolicy) -> Query | None:
+    """The query as it is asked again, in the scene of its answer alone and with the camera that this reports.
+
+    None where that camera is estimated and not known well enough for the policy.
+    """
+    assert result.scene_key is not None
+    kept = replace(query, photo=replace(query.photo, depth=None), scene_key=result.scene_key, scenes=(), is_part=False)
+    if query.photo.exif is None:
+        return kept
+    camera = used_camera(result, query.options, query.photo)
+    if camera is None or camera.sigma is None:
+        return None
+    error_m = camera_error_m(camera.camera, camera.sigma.focal_share, distance_shown(result))
+    return read_with(kept, camera) if error_m <= policy.max_radius_m else None
 
 
 def shares_compared(found: Evidence, result: Result) -> dict[str, float]:

@@ -56,6 +56,9 @@ class Waiting:
         self._candidates: deque[Candidate] = deque()
         self._arrived = asyncio.Event()
 
+    def __contains__(self, candidate: Candidate) -> bool:
+        return candidate in self._candidates
+
     def __len__(self) -> int:
         return len(self._candidates)
 
