@@ -118,8 +118,10 @@ def _read_state(connection: Connection, scene_key: SceneKey, until_generation: i
     last = (connection.execute(it.limit(1)).first() for it in (last_added, last_removed))
     _, last_change = max((tuple(it) for it in last if it is not None), default=(0, ""))
     standing = tables.reference_standing
-    of_scene = standing.join(tables.reference, standing.c.reference_key == added.key)
-    retired = select(func.count()).select_from(of_scene).where(added.scene_id == scene_key)
+    # Not where the scene is this one: a planner would then read all its references, of which hardly any is retired.
+    retired = select(func.count().filter(added.scene_id == scene_key)).select_from(
+        standing.join(tables.reference, standing.c.reference_key == added.key)
+    )
     retired_count = connection.scalar(retired.where(standing.c.retire_time_us.is_not(None))) or 0
     count = scene.reference_count - retired_count
     return IndexState(scene.create_time_us, scene.generation, count, last_change)
