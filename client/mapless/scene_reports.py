@@ -151,7 +151,8 @@ class SceneReport:
         scene_id: the scene.
         first_day, last_day: UTC.
         periods: all periods between, in order, also those without photographs.
-        places: places of which photographs were counted, those with most rejected ones first, at most 1000.
+        places: places that need a new survey, then others of which photographs were counted, those with most rejected
+            ones first; at most 1000.
         omitted_place_count: further places, which are left out.
         suggestions: where further references would help, the one that would help most first, at most 10.
         events: references that were adopted or retired, in order of time, the last 1000. Adopted ones that have been

@@ -26,10 +26,11 @@ def test_a_scene_that_ages_has_metrics(tmp_path: Path) -> None:
             new = replace(make_reference(name), provenance=known, place_key=keys["a"])
             adoption.adopt(store, HALL, new, 9)
         adoption.retire(store, HALL, [keys["c"]], RetirementReason.CONTRADICTED)
-        shares = {keys["a"]: 0.35, keys["b"]: 0.7}
-        adoption.change_standings(
-            store.database, shares, lambda key, _: Standing(surveyed_share=shares[key], photograph_count=20)
-        )
+        known_of = {
+            keys["a"]: adoption.outdated(Standing(surveyed_share=0.35, photograph_count=20)),
+            keys["b"]: Standing(surveyed_share=0.7, photograph_count=20),
+        }
+        adoption.change_standings(store.database, known_of, lambda key, _: known_of[key])
         today = now_us() // DAY_US
         planted = {
             CountKey(today, "p", LOCALIZED): Sums(photograph_count=6),

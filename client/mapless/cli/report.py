@@ -4,6 +4,7 @@ import argparse
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from datetime import date, timedelta
+from textwrap import wrap
 
 from ..client import Client
 from ..scene_reports import PeriodCounts, PlaceReport, SceneReport
@@ -13,6 +14,8 @@ from .output import card, show, table
 DEFAULT_WEEKS, MOST_WEEKS = 4, 500
 WORST_PLACES, SUGGESTIONS, NAMED_PLACES = 5, 3, 10
 """Places and suggestions that are printed; JSON has all."""
+WIDTH = 100
+"""Characters of a line of a suggestion."""
 
 
 def add_report(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -94,7 +97,7 @@ def report_text(report: SceneReport) -> list[str]:
     if not any(it.photograph_count for it in report.periods):
         return [*lines, "no photographs were counted"]
     lines += _periods(report)
-    rejecting = [it for it in report.places if rejected_count(it)]
+    rejecting = sorted((it for it in report.places if rejected_count(it)), key=rejected_count, reverse=True)
     if rejecting:
         lines += ["", "Where photographs are rejected:", *_worst(rejecting)]
     outdated = [it.reference_id for it in report.places if it.is_outdated]
@@ -105,7 +108,8 @@ def report_text(report: SceneReport) -> list[str]:
         lines += ["", *_events(report)]
     if report.suggestions:
         lines += ["", "What would help most:"]
-        lines += [f"{i}. {it.message}" for i, it in enumerate(report.suggestions[:SUGGESTIONS], 1)]
+        for i, it in enumerate(report.suggestions[:SUGGESTIONS], 1):
+            lines += wrap(f"{i}. {it.message}", WIDTH, subsequent_indent="   ")
     return lines
 
 

@@ -37,17 +37,16 @@ def ages(store: Store, most: int) -> list[SceneAge]:
 
 def _age(store: Store, scene: BusyScene) -> SceneAge | None:
     try:
-        policy = store.get_attributes(scene.scene_key).adoption
+        adopts = store.get_attributes(scene.scene_key).adoption is not None
     except (NotFound, DataLoss):
         return None
     least = AdoptionOptions().least_photographs
-    shares = list(adoption.list_places(store.database, scene.scene_key, least).values()) if policy else []
     return SceneAge(
         scene.scene_key,
         scene.photograph_count,
         scene.localized_count / scene.photograph_count,
         scene.localized_before / scene.photographs_before if scene.photographs_before else None,
-        min(shares, default=None),
-        sum(policy is not None and it < policy.min_surveyed_share for it in shares),
+        counts.least_surveyed_share(store.database, scene.scene_key, least) if adopts else None,
+        len(adoption.list_outdated(store.database, scene.scene_key)) if adopts else 0,
         *counts.count_references(store.database, scene.scene_key),
     )

@@ -14,7 +14,7 @@ from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.wire import FieldError
 from mapless_server.security import SceneKey, scene_id_of
-from mapless_server.store import ReferenceRecord, Retirement, RetirementReason, SceneRecord, Store
+from mapless_server.store import ReferenceRecord, Retirement, RetirementReason, Store
 
 from .messages.enums import enum_to_message
 from .messages.references import reference_to_message, retirement_of
@@ -32,15 +32,17 @@ EPOCH = date(1970, 1, 1)
 def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRequest) -> pb.SceneReport:
     """The report that a request asks for; FieldError names a wrong day, NotFound if there is no such scene."""
     from mapless_server.scenes.report.summary import Cluster, by_place, periods_of, suggestions
+    from mapless_server.store.adoption import list_outdated
     from mapless_server.store.counts import find_references, read_report
 
     first, last, days = days_from_message(request, datetime.now(timezone.utc).date())
     scene, scene_id = store.get_scene(scene_key), scene_id_of(scene_key)
     stored = read_report(store.database, scene_key, first, last, MOST_EVENTS)
-    keys = {it.place_key for it in stored.counts} | {it.place_key for it in stored.events}
+    outdated = list_outdated(store.database, scene_key) if scene.attributes.adoption else {}
+    keys = {*(it.place_key for it in stored.counts), *(it.place_key for it in stored.events), *outdated}
     records = find_references(store.database, scene_key, keys)
-    places = by_place(stored.counts, records)
-    outdated = {key: _is_outdated(scene, record) for key, record in records.items()}
+    counted = by_place(stored.counts, records)
+    places = {key: counted.get(key, {}) for key in outdated} | counted
     periods = periods_of(stored.counts, first, last, days)
     message = pb.SceneReport(
         scene=names.scene_name(scene_id),
@@ -56,22 +58,17 @@ def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRe
             record,
             periods_of(counts, first, last, days),
             None if record is None else Cluster.of_rejected(counts, record.world_from_camera),
-            is_outdated=outdated.get(key, False),
+            is_outdated=key in outdated,
             adopted=stored.adopted.get(key, (0, 0)),
         )
         message.places.append(its)
     poses = {key: record.world_from_camera for key, record in records.items()}
     for it in suggestions(places, poses, last):
         at, unit = records[it.place_key], scene.attributes.unit
-        message.suggestions.append(suggestion_to_message(it, at, unit, outdated[it.place_key]))
+        message.suggestions.append(suggestion_to_message(it, at, unit, it.place_key in outdated))
     ids = {key: record.reference_id for key, record in records.items()}
     message.events.extend(event_to_message(it, scene_id, ids) for it in reversed(stored.events))
     return message
-
-
-def _is_outdated(scene: SceneRecord, place: ReferenceRecord) -> bool:
-    standing = place.standing
-    return scene.attributes.adoption is not None and standing is not None and standing.outdate_time_us is not None
 
 
 def days_from_message(request: pb.GetSceneReportRequest, today: date) -> tuple[int, int, int]:

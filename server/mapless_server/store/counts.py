@@ -232,3 +232,16 @@ def count_references(database: Database, scene_key: SceneKey) -> ReferenceNumber
     retired = number.join(reference_standing, standing.reference_key == key).where(standing.retire_time_us.is_not(None))
     with database.read() as connection:
         return ReferenceNumbers(connection.scalar(adopted) or 0, connection.scalar(retired) or 0)
+
+
+def least_surveyed_share(database: Database, scene_key: SceneKey, least_photographs: int) -> float | None:
+    """Least share of the survey that is left at a place of a scene with so many photographs; None without any."""
+    standing = reference_standing.c
+    least: Select[Any] = (
+        select(func.min(standing.surveyed_share))
+        .join(reference, reference.c.key == standing.reference_key)
+        .where(reference.c.scene_id == scene_key, standing.photograph_count >= least_photographs)
+    )
+    with database.read() as connection:
+        share: float | None = connection.scalar(least)
+        return share

@@ -19,8 +19,8 @@ from mapless_server.store.counts import LOCALIZED, CountKey, Sums
 HALF_LIFE_DAYS = 14
 """Age after which a photograph counts half for suggestions: two weekly reports. A convention."""
 MOST_SUGGESTIONS = 10
-LEAST_RESCUED = 0.5
-"""Places where fewer photographs would be rescued are not suggested: one that was rejected alone, two weeks ago."""
+LEAST_RESCUED = 2.0
+"""Places where fewer photographs would be rescued are not suggested: one photograph says little."""
 
 LACKING_EVIDENCE = frozenset(
     {

@@ -1,0 +1,108 @@
+"""The weekly report of a scene, as an operator reads it; planted counts."""
+
+import json
+from collections.abc import Callable
+from datetime import date, datetime, timezone
+
+import pytest
+from support.commands import run_client
+from support.servers import RunningServer
+
+from mapless import AdoptionPolicy, Client
+from mapless_server.security import SceneKey
+from mapless_server.store import RetirementReason, Store, adoption, counts
+from mapless_server.store.counts import LOCALIZED, CountKey, Sums
+
+Run = Callable[..., tuple[int, str, str]]
+LAST = date(2026, 3, 15)
+TODAY = (LAST - date(1970, 1, 1)).days
+
+
+@pytest.fixture
+def run(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Runs the command, which prints text: exit code, output and error output."""
+    return lambda *arguments: run_client(capsys, "--address", server.address, "scene", "report", *arguments)
+
+
+@pytest.fixture
+def aging(server: RunningServer, scene: str) -> tuple[Store, str]:
+    """A scene of which r1 was localized in the first week and half the time in the second; r0 had dark photographs."""
+    store: Store = server.engine.references.retrievals[0].indexes._store
+    key, other = (store.find_keys(SceneKey(scene), [it])[it] for it in ("r1", "r0"))
+    beyond = Sums(8, position_count=8, offset_x=16.0, squared_offset=32.0, forward_z=8.0)
+    planted = {
+        CountKey(TODAY - 7, key, LOCALIZED): Sums(20, 20.0, 4000, 20, -80.0),
+        CountKey(TODAY, key, LOCALIZED): Sums(10, 4.0, 1000, 10, -30.0),
+        CountKey(TODAY, key, "low_overlap"): beyond,
+        CountKey(TODAY, key, "gate"): Sums(2),
+        CountKey(TODAY - 1, other, "low_texture"): Sums(3),
+    }
+    counts.add_counts(store.database, {SceneKey(scene): planted})
+    return store, scene
+
+
+def test_an_operator_sees_weeks_places_and_what_helps(run: Run, aging: tuple[Store, str]) -> None:
+    _, scene = aging
+    code, text, _ = run(scene, "--text", "--weeks", 2, "--until", LAST)
+    lines = text.splitlines()
+    assert (code, lines[0]) == (0, f"{scene}, 2026-03-02 to 2026-03-15 (UTC)")
+    assert lines[3].split() == ["2026-03-02", "20", "100", "%", "1.8", "cm", "200", "100", "%"]
+    assert lines[4].startswith(
+        "2026-03-09           23       43 %       5.0 cm      100      40 %  LOW_OVERLAP 8, LOW_TEX"
+    )
+    assert [it.split()[:3] for it in lines[8:10]] == [["r1", "10", "40"], ["r0", "3", "3"]]
+    advice = " ".join(it.strip() for it in lines[lines.index("What would help most:") + 1 :])
+    assert advice.startswith("1. 10 of 40 photographs around r1 were rejected, most often because they do not connect")
+    assert "2 m from r1, looking along (0.0, 0.0, 1.0): add references there" in advice
+    assert "r0 were rejected" not in advice  # dark photographs
+
+
+def test_a_bad_week_and_an_outdated_place_are_exit_codes(run: Run, aging: tuple[Store, str], client: Client) -> None:
+    store, scene = aging
+    period = ["--text", "--until", LAST, "--alert-below"]
+    assert [run(scene, *period, share)[0] for share in ("0.4", "0.45")] == [0, 3]
+    client.update_scene(scene, adoption=AdoptionPolicy())
+    keys = store.find_keys(SceneKey(scene), ["r1", "r2"])
+    adoption.change_standings(store.database, keys.values(), lambda _, it: adoption.outdated(it))
+    code, text, _ = run(scene, *period, "0.4")
+    assert code == 3
+    assert "Places that need a new survey: r1, r2\n" in text
+    assert "the place has changed: survey it again" in " ".join(text.split())
+
+
+def test_what_was_retired_is_summed_by_reason(run: Run, aging: tuple[Store, str]) -> None:
+    store, scene = aging
+    keys = store.find_keys(SceneKey(scene), ["r0", "r2"])
+    adoption.retire(store, SceneKey(scene), list(keys.values()), RetirementReason.CONTRADICTED)
+    today = datetime.now(timezone.utc).date()
+    _, text, _ = run(scene, "--text", "--since", LAST, "--until", today)
+    assert "retired  2 (2: photographs from about its viewpoint do not show what it shows)" in text
+
+
+def test_programs_get_all_of_it(run: Run, aging: tuple[Store, str]) -> None:
+    _, scene = aging
+    found = json.loads(run(scene, "--json", "--since", LAST, "--until", LAST, "--by-day")[1])
+    (period,) = found["periods"]
+    assert (period["first_day"], period["rejections"]) == ("2026-03-15", {"LOW_OVERLAP": 8, "GATE": 2})
+    assert found["places"][0]["rejected_position"]["photograph_count"] == 8
+
+
+def test_a_scene_without_photographs_says_so(run: Run, scene: str) -> None:
+    code, text, _ = run(scene, "--text", "--alert-below", "0.9")
+    assert (code, text.splitlines()[-1]) == (0, "no photographs were counted")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--since", "monday"], "no day such as 2026-11-02"),
+        (["--weeks", "0"], "must be 1 to 500"),
+        (["--weeks", "2", "--since", "2026-03-01"], "not allowed with"),
+        (["--alert-below", "90"], "must be 0 to 1"),
+        (["--since", "2026-03-02", "--until", "2026-03-01"], "--since 2026-03-02 is after --until 2026-03-01"),
+    ],
+)
+def test_wrong_days_are_named(run: Run, scene: str, arguments: list[str], said: str) -> None:
+    code, _, error = run(scene, *arguments)
+    assert code == 2
+    assert said in error
