@@ -181,6 +181,21 @@ def _noise() -> bytes:
     return jpeg.tobytes()
 
 
+def test_a_flood_by_one_token_makes_nothing_useless(held: Held) -> None:
+    """Photographs of the place that show nothing of the adopted one, on one day."""
+    query = held.place.queries[0]
+    candidate = held.candidate(query)
+    assert held.consider(candidate) is None
+    (only,) = adoption.list_adopted(held.store.database, ROOM)
+    adoption.set_usefulness(held.store.database, {only.key: 0.8})
+    without = {name: it for name, it in candidate.answered.inliers_of.items() if name != only.reference_id}
+    foreign = replace(candidate, answered=replace(candidate.answered, inliers_of=without), holder="robot")
+    for _ in range(3):
+        held.consider(foreign)
+    (only,) = adoption.list_adopted(held.store.database, ROOM)
+    assert only.usefulness == pytest.approx(0.8 * 0.9)
+
+
 def _pixels(photograph: Photograph) -> NDArray[np.uint8]:
     return np.asarray(cv2.imdecode(np.frombuffer(photograph.data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
 

@@ -91,6 +91,7 @@ class Keeper:
         """
         database, answered, scene_key = self._store.database, candidate.answered, candidate.query.scene_key
         share, now_us = rules.surveyed_share(answered, surveyed), time_us(now)
+        counted = set[str]()
 
         def learned(key: str, known: Standing) -> Standing:
             # Once outdated it stays so until a new survey: answers by what is left of the old one say nothing.
@@ -98,6 +99,8 @@ class Keeper:
             if candidate.query.photo.mask or known.outdate_time_us is not None:
                 return known
             made = rules.with_share(known, share, now_us, candidate.holder, options)
+            if made is not known:
+                counted.add(key)
             if not rules.needs_survey(made, policy, options):
                 return made
             log.warning("scene %s: the place of %s needs a new survey", scene_key, place.id_of[key])
@@ -112,6 +115,8 @@ class Keeper:
         await self._retire(scene_key, leaving, RetirementReason.SURVEY_OUTDATED)
         if place.key in outdated:
             return True
+        if candidate.holder and place.key not in counted:  # else one token could have useful ones leave
+            return False
         total = max(answered.inlier_count, 1)
         useful = {
             it.key: rules.with_usefulness(it.usefulness, answered.inliers_of.get(it.reference_id, 0) / total, options)
