@@ -35,6 +35,7 @@ MODULES = {
     "depth_errors": ("depth-errors",),
     "rolling_shutter": ("rolling-shutter",),
     "depth_scores": ("depth-scores", "depth-radius"),
+    "adopting": ("adoption-matches", "adoption-rivals", "adoption-contradictions"),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }
 """The keys of each module, by its MEASUREMENTS; a module is imported when one of them is measured."""

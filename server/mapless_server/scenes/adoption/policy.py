@@ -31,8 +31,8 @@ MOST_WITNESSES = 100
 class AdoptionOptions:
     """Bounds of adoption that are the same for all scenes.
 
-    All are conventions: none was chosen among alternatives by a measurement. `research.renovation` and
-    `research.adoption_attack` measure what all of them together lead to.
+    Those about days, holders and means are policy, and so are what counts as new and as explained: how much is worth
+    keeping. `research.renovation` and `research.adoption_attack` measure what all of them together lead to.
 
     Attributes:
         min_matches: least matches with surveyed references that agree with the pose from them.
@@ -53,6 +53,8 @@ class AdoptionOptions:
         contradictions, contradicting_days, contradicting_holders: contradictions in a row after which a reference is
             retired, least days on which they came, and least holders of tokens from whom. Each holder counts once a
             day. A holder who may change the scene could delete the reference, and needs no other.
+
+    Evidence: adoption-matches, adoption-rivals, adoption-contradictions.
     """
 
     min_matches: int = 30
