@@ -37,21 +37,28 @@ class Cameras:
 
 
 def down_of(scene: Scene | None, poses: Sequence[RigidTransform]) -> Array:
-    """The direction of gravity (3,) of the scene or its datum; without, as the cameras (at least one) suggest.
+    """The direction of gravity (3,) of the scene or its datum; without, as the cameras (at least one) suggest."""
+    return vertical_of(scene, poses)[0]
 
-    That is the mean of their y axes or, if these disagree, the normal of the plane of their centres.
+
+def vertical_of(scene: Scene | None, poses: Sequence[RigidTransform]) -> tuple[Array, str]:
+    """The direction of gravity (3,), world, and how it is known, in words.
+
+    It is that of the scene or its datum, else the mean of the y axes of cameras (at least one) or, if these disagree,
+    the normal of the plane of their centres.
     """
     if scene is not None and scene.down_in_world is not None:
-        return np.asarray(scene.down_in_world, float)
+        return np.asarray(scene.down_in_world, float), "along the scene's direction of gravity"
     if scene is not None and scene.datum is not None:
-        return np.asarray(-scene.datum.enu_from_world.matrix()[2])
+        return np.asarray(-scene.datum.enu_from_world.matrix()[2]), "along the vertical of the scene's datum"
     mean = np.mean([it.rotation[:, 1] for it in poses], axis=0)
     length = float(np.linalg.norm(mean))
     if length > _ALIKE:
-        return np.asarray(mean / length)
+        return np.asarray(mean / length), "along the mean vertical of the cameras, since the scene has no gravity"
     centres = np.stack([it.translation for it in poses])
     normal = np.linalg.svd(centres - centres.mean(axis=0))[2][-1]
-    return np.asarray(normal if normal @ mean >= 0 else -normal)
+    known = "along the direction in which references are spread least, since the scene has no gravity"
+    return np.asarray(normal if normal @ mean >= 0 else -normal), known
 
 
 def basis_from_above(down_in_world: ArrayLike) -> Array:
@@ -91,13 +98,13 @@ def draw_plan(
     margin = 1.5 * _WEDGE_SHARE * extent
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     axes.set_aspect("equal", adjustable="box")
-    axes.set(xlabel=_axis_label(basis[0], unit), ylabel=_axis_label(basis[1], unit))
+    axes.set(xlabel=axis_label(basis[0], unit), ylabel=axis_label(basis[1], unit))
 
 
 def _wedge(basis: Array, pose: RigidTransform, camera: Camera, length: float) -> Array:
     """Corners (C, 2) of a camera's field of view; of a ring if it looks straight up or down."""
-    centre, ahead = basis @ pose.translation, basis @ pose.rotation[:, 2]
-    if np.linalg.norm(ahead) < _LEVEL:
+    centre, ahead = basis @ pose.translation, heading_of(basis, pose.rotation[:, 2])
+    if ahead is None:
         turns = np.linspace(0, 2 * np.pi, 17)
         return np.asarray(centre + 0.3 * length * np.stack([np.cos(turns), np.sin(turns)], axis=1))
     half = math.atan2(camera.width_px / 2, camera.focal_x_px)
@@ -105,7 +112,14 @@ def _wedge(basis: Array, pose: RigidTransform, camera: Camera, length: float) ->
     return np.concatenate([centre[None], centre + length * np.stack([np.cos(turns), np.sin(turns)], axis=1)])
 
 
-def _axis_label(direction: Array, unit: str) -> str:
+def heading_of(basis: Array, forward: ArrayLike) -> Array | None:
+    """The direction (2,) on the page of a viewing direction (3,), unit length; None if it looks up or down."""
+    ahead = basis @ np.asarray(forward, float)
+    length = float(np.linalg.norm(ahead))
+    return None if length < _LEVEL else np.asarray(ahead / length)
+
+
+def axis_label(direction: Array, unit: str) -> str:
     """The name of the world axis along a direction, and the unit; the unit alone if none is along it."""
     largest = int(np.argmax(np.abs(direction)))
     sign = "-" if direction[largest] < 0 else ""
@@ -131,4 +145,4 @@ def draw_ellipse(axes: Axes, basis: Array, covariance: Array, unit: str = "m") -
     axes.plot(0, 0, marker="+", color=FOUND, linestyle="none")
     axes.set(xlim=(-1.3 * long, 1.3 * long), ylim=(-1.3 * long, 1.3 * long))
     axes.set_aspect("equal", adjustable="box")
-    axes.set(xlabel=_axis_label(basis[0], name), ylabel=_axis_label(basis[1], name))
+    axes.set(xlabel=axis_label(basis[0], name), ylabel=axis_label(basis[1], name))

@@ -22,6 +22,7 @@ TOOLS = {
     "replay-bag": ["recording", "scene", "out"],
     "reconstruct": ["photographs", "out"],
     "extend": ["scene", "photographs"],
+    "report": ["scene"],
     "view": ["scene"],
     "gateway": [],
     "demo": [],

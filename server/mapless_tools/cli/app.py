@@ -18,6 +18,7 @@ from mapless_tools.gateway.command import gateway_command
 from mapless_tools.ingest.command import ImportCommand, export_command, import_command
 from mapless_tools.reconstruct.command import reconstruct_command
 from mapless_tools.replay.command import replay_bag_command, replay_command
+from mapless_tools.report.command import report_command
 from mapless_tools.view.command import view_command
 
 from .audit import audit_command
@@ -89,6 +90,7 @@ _add_tool("draw", draw_command)
 _add_tool("evaluate", evaluate_command)
 _add_tool("replay", replay_command)
 _add_tool("replay-bag", replay_bag_command)
+_add_tool("report", report_command)
 _add_tool("view", view_command, extra="view")
 _add_tool("gateway", gateway_command, extra="gateway")
 _add_tool("demo", demo_command)
