@@ -304,7 +304,9 @@ def seeds() -> tuple[bytes, ...]:
             scene=scene, page_size=2, page_token=_token(pb.ListReferencesRequest(scene=scene, page_size=2))
         ),
         pb.DeleteReferenceRequest(name=reference),
+        pb.RetireReferenceRequest(name=reference),
         pb.RestoreReferenceRequest(name=reference),
+        pb.RestoreReferencesRequest(scene=scene, place=reference),
         retrieve,
         pb.AuditSceneRequest(
             scene=scene, page_size=2, page_token=_token(pb.AuditSceneRequest(scene=scene, page_size=2))

@@ -75,7 +75,9 @@ class Client(Connection):
     get_reference = references.get_reference
     list_references = references.list_references
     delete_reference = references.delete_reference
+    retire_reference = adoption.retire_reference
     restore_reference = adoption.restore_reference
+    restore_references = adoption.restore_references
     undo_adoption = adoption.undo_adoption
 
     retrieve_references = references.retrieve_references

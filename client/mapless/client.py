@@ -111,7 +111,9 @@ class Client(Connection):
     get_reference = _blocking(references.get_reference)
     list_references = _iterated(references.list_references)
     delete_reference = _blocking(references.delete_reference)
+    retire_reference = _blocking(adoption.retire_reference)
     restore_reference = _blocking(adoption.restore_reference)
+    restore_references = _blocking(adoption.restore_references)
     undo_adoption = _blocking(adoption.undo_adoption)
 
     retrieve_references = _blocking(references.retrieve_references)

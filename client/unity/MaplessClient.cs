@@ -100,6 +100,10 @@ namespace Mapless
             MethodOf(ReferenceService, "ListReferences", ListReferencesRequest.Parser, ListReferencesResponse.Parser);
         private static readonly Method<DeleteReferenceRequest, DeleteReferenceResponse> DeleteReferenceMethod =
             MethodOf(ReferenceService, "DeleteReference", DeleteReferenceRequest.Parser, DeleteReferenceResponse.Parser);
+        private static readonly Method<RetireReferenceRequest, RetireReferenceResponse> RetireReferenceMethod =
+            MethodOf(ReferenceService, "RetireReference", RetireReferenceRequest.Parser, RetireReferenceResponse.Parser);
+        private static readonly Method<RestoreReferencesRequest, RestoreReferencesResponse> RestoreReferencesMethod =
+            MethodOf(ReferenceService, "RestoreReferences", RestoreReferencesRequest.Parser, RestoreReferencesResponse.Parser);
         private static readonly Method<RestoreReferenceRequest, RestoreReferenceResponse> RestoreReferenceMethod =
             MethodOf(ReferenceService, "RestoreReference", RestoreReferenceRequest.Parser, RestoreReferenceResponse.Parser);
         private static readonly Method<RetrieveReferencesRequest, RetrieveReferencesResponse> RetrieveReferencesMethod =
@@ -458,6 +462,23 @@ namespace Mapless
             var request = new DeleteReferenceRequest { Name = reference };
             var gone = Gone(new DeleteReferenceResponse());
             return CallAsync(DeleteReferenceMethod, request, SceneOf(reference), timeout, cancellation, gone);
+        }
+
+        /// <summary>Has a reference not chosen for photographs any more.</summary>
+        public async Task<Reference> RetireReferenceAsync(
+            string reference, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            var request = new RetireReferenceRequest { Name = reference };
+            var answer = await CallAsync(RetireReferenceMethod, request, SceneOf(reference), timeout, cancellation)
+                .ConfigureAwait(true);
+            return answer.Reference;
+        }
+
+        /// <summary>Has all retired references of a scene chosen again, or some of them.</summary>
+        public Task<RestoreReferencesResponse> RestoreReferencesAsync(
+            RestoreReferencesRequest request, TimeSpan timeout, CancellationToken cancellation = default)
+        {
+            return CallAsync(RestoreReferencesMethod, request, request.Scene, timeout, cancellation);
         }
 
         /// <summary>Has a retired reference chosen again.</summary>

@@ -60,6 +60,29 @@ def test_retired_references_are_shown_and_restored(run: Run, server: RunningServ
     assert list(client.list_references(scene, only_retired=True)) == []
 
 
+def test_a_reference_is_retired_and_restored_by_command(run: Run, client: Client, scene: str) -> None:
+    for it in ("r0", "r1"):
+        assert run("reference", "retire", scene, it) == (0, f"{it} is not chosen for photographs any more\n", "")
+    assert "by request" in run("reference", "list", scene, "--retired")[1]
+    code, text, _ = run("reference", "restore", scene, "--place", "r1", "--since", "2026-01-01")
+    assert (code, text.splitlines()) == (0, ["1 reference chosen for photographs again", "  r1"])
+    assert "1 reference" in run("reference", "restore", scene, "--all")[1]
+    assert list(client.list_references(scene, only_retired=True)) == []
+    for flags in ((), ("r1", "--all")):
+        code, _, error = run("reference", "restore", scene, *flags)
+        assert (code, "give one reference, or --all" in error) == (2, True)
+
+
+def test_an_arbitrary_unit_has_no_default_radius(run: Run, client: Client, scene: str) -> None:
+    client.update_scene(scene, arbitrary_unit=True)
+    code, _, error = run("scene", "update", scene, "--adopt")
+    assert (code, "the scene's unit is arbitrary" in error) == (2, True)
+    code, text, error = run("scene", "update", scene, "--adopt", "--adopt-radius", "0.2")
+    assert (code, "within 0.2 units (68 %)" in text) == (0, True)
+    assert "deleted 24 h after it was adopted" in error
+    assert "within 0.2 units (68 %)" in run("scene", "get", scene)[1]
+
+
 def test_places_with_the_least_survey_left_come_first(run: Run, server: RunningServer, scene: str) -> None:
     store = server.engine.references.retrievals[0].indexes._store
     keys = store.find_keys(SceneKey(scene), ["r0", "r2"])

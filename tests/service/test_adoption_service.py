@@ -99,6 +99,25 @@ def test_a_wrong_vouching_is_refused_by_field(stubs: Stubs, scene: str, change: 
     assert (error.code, error.field) == ("INVALID_ARGUMENT", f"reference.provenance.{field}")
 
 
+def test_a_reference_is_retired_by_hand_and_all_restored(client: Client, scene: str) -> None:
+    assert "by request" in client.retire_reference(scene, "r1").retirement
+    client.retire_reference(scene, "r2")
+    audits = {it.name.rpartition("/")[2]: it.verdict for it in client.audit_scene(scene)}
+    assert (audits["r1"], audits["r2"]) == ("RETIRED", "RETIRED")
+    assert client.restore_references(scene, place="r1") == ["r1"]
+    assert [it.reference_id for it in client.list_references(scene, only_retired=True)] == ["r2"]
+    assert client.restore_references(scene, since=datetime.now(timezone.utc) + timedelta(minutes=5)) == []
+    assert client.restore_references(scene) == ["r2"]
+    with pytest.raises(ValueError, match="time zone"):
+        client.restore_references(scene, since=datetime(2026, 11, 29))
+
+
+def test_a_scene_that_adopts_says_how_long_it_keeps(client: Client, scene: str) -> None:
+    (said,) = client.update_scene(scene, adoption=AdoptionPolicy()).warnings
+    assert said.startswith("what it adopts is deleted 24 h after it was adopted")
+    assert client.update_scene(scene, adoption=None).warnings == ()
+
+
 def test_a_retired_reference_is_named_and_restored(client: Client, server: RunningServer, scene: str) -> None:
     store, scene_key = store_of(server), SceneKey(scene)
     adoption.retire(store, scene_key, [key_of(server, scene, "r1")], RetirementReason.CONTRADICTED)

@@ -71,7 +71,9 @@ GOOD: dict[str, Message] = {
     "GetReference": reference_pb.GetReferenceRequest(name=REFERENCE),
     "ListReferences": reference_pb.ListReferencesRequest(scene=SCENE),
     "DeleteReference": reference_pb.DeleteReferenceRequest(name=REFERENCE),
+    "RetireReference": reference_pb.RetireReferenceRequest(name=REFERENCE),
     "RestoreReference": reference_pb.RestoreReferenceRequest(name=REFERENCE),
+    "RestoreReferences": reference_pb.RestoreReferencesRequest(scene=SCENE),
     "CreateScene": reference_pb.CreateSceneRequest(scene_id="s", datum=KNOWN.datum, down_in_world=KNOWN.down_in_world),
     "GetScene": reference_pb.GetSceneRequest(name=SCENE),
     "UpdateScene": reference_pb.UpdateSceneRequest(
@@ -220,7 +222,9 @@ BAD: dict[str, list[Case]] = {
         *(("page_token", token_of("acme", it)) for it in ("scenes/t", f"{SCENE} audit")),
     ],
     "DeleteReference": [("name", "scenes/../references/x")],
+    "RetireReference": [("name", "scenes/../references/x")],
     "RestoreReference": [("name", "scenes/../references/x")],
+    "RestoreReferences": [("scene", "s"), ("place", "x"), ("place", "scenes/other/references/x"), ("since.nanos", -1)],
     "GetSceneReport": [("scene", "s"), ("first_day", "today"), ("last_day", "2026-13-01"), ("days_per_period", 367)],
     "CreateScene": [
         ("scene_id", ".."),

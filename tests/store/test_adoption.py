@@ -177,6 +177,42 @@ def test_retiring_twice_and_restoring_others_changes_nothing(place: Place) -> No
             store.restore_reference(HALL, "gone")
 
 
+def test_an_operator_retires_a_reference_once(place: Place) -> None:
+    with place.open() as store:
+        keys = hall(store)
+        retired = adoption.retire_by_operator(store, HALL, "a").retired
+        assert retired is not None
+        assert retired.reason is RetirementReason.BY_OPERATOR
+        assert indexed(store) == ["b"]
+        assert adoption.retire_by_operator(store, HALL, "a").retired == retired
+        adoption.retire(store, HALL, [keys["b"]], RetirementReason.CONTRADICTED)
+        again = adoption.retire_by_operator(store, HALL, "b").retired
+        assert again is not None
+        assert again.reason is RetirementReason.CONTRADICTED
+        with pytest.raises(NotFound):
+            adoption.retire_by_operator(store, HALL, "gone")
+
+
+def test_all_retired_ones_are_restored_or_some_of_them(place: Place) -> None:
+    with place.open() as store:
+        keys = hall(store)
+        for name, here in (("at a", "a"), ("at b", "b")):
+            adoption.adopt(store, HALL, replace(adopted(name), place_key=keys[here]), 9)
+        names = {it.reference_id: it.key for it in store.list_references(HALL, 10)}
+        for key in names.values():
+            adoption.retire(store, HALL, [key], RetirementReason.VOUCHERS_GONE)
+        assert indexed(store) == []
+        assert adoption.restore(store, HALL, place_id="a") == ["a", "at a"]
+        assert indexed(store) == ["a", "at a"]
+        later = datetime.now(timezone.utc) + timedelta(hours=1)
+        assert adoption.restore(store, HALL, since=later) == []
+        assert adoption.restore(store, HALL, since=later - timedelta(days=1)) == ["at b", "b"]
+        assert sorted(indexed(store)) == ["a", "at a", "at b", "b"]
+        assert adoption.restore(store, HALL) == []
+        with pytest.raises(NotFound):
+            adoption.restore(store, HALL, place_id="gone")
+
+
 def test_standings_are_counted_and_forgotten_when_restored(place: Place) -> None:
     with place.open() as store:
         keys = hall(store)

@@ -49,7 +49,9 @@ def requests_on(scene_id: str, reference_id: str = "r", new_id: str = "r") -> di
         ),
         "GetSceneReport": reference_pb.GetSceneReportRequest(scene=scene),
         "UpdateScene": reference_pb.UpdateSceneRequest(scene=known, update_mask={"paths": ["down_in_world"]}),
+        "RetireReference": reference_pb.RetireReferenceRequest(name=reference),
         "RestoreReference": reference_pb.RestoreReferenceRequest(name=reference),
+        "RestoreReferences": reference_pb.RestoreReferencesRequest(scene=scene),
         "DeleteReference": reference_pb.DeleteReferenceRequest(name=reference),
         "DeleteScene": reference_pb.DeleteSceneRequest(name=scene),
     }

@@ -3,12 +3,48 @@
 from datetime import datetime
 from typing import Any
 
+from .. import wire
 from ..connection import Connection
 from ..messages import reference_from_message
-from ..names import reference_name
+from ..names import parse_reference_name, reference_name, scene_name
 from ..results import Reference
 from ..v1 import reference_service_pb2 as pb
 from .references import delete_reference, list_references
+
+
+async def retire_reference(
+    connection: Connection, scene: str, reference: str, *, timeout_s: float | None = None
+) -> Reference:
+    """Has a reference not chosen for photographs any more; it stays stored, and `restore_reference` undoes it."""
+    request = pb.RetireReferenceRequest(name=reference_name(scene, reference))
+    return await connection.call("RetireReference", request, _reference, timeout_s)
+
+
+async def restore_references(
+    connection: Connection,
+    scene: str,
+    *,
+    since: datetime | None = None,
+    place: str = "",
+    timeout_s: float | None = None,
+) -> list[str]:
+    """Has the retired references of a scene chosen again, as one change; returns their ids, ordered.
+
+    Args:
+        scene: the scene.
+        since: only those that were retired at this time, with time zone, by the server's clock, or later.
+        place: only those of the place of this surveyed reference: itself, and what was adopted there.
+        timeout_s: deadline of the call.
+    """
+    request = pb.RestoreReferencesRequest(scene=scene_name(scene), place=reference_name(scene, place) if place else "")
+    if since is not None:
+        _check_zone(since)
+        wire.set_time(request.since, since, "since")
+    return await connection.call("RestoreReferences", request, _ids, timeout_s)
+
+
+def _ids(response: Any) -> list[str]:
+    return [parse_reference_name(it)[1] for it in response.references]
 
 
 async def restore_reference(
@@ -17,6 +53,11 @@ async def restore_reference(
     """Has a retired reference chosen again, and forgets what was held against it; one that is not retired is kept."""
     request = pb.RestoreReferenceRequest(name=reference_name(scene, reference))
     return await connection.call("RestoreReference", request, _reference, timeout_s)
+
+
+def _check_zone(since: datetime) -> None:
+    if since.tzinfo is None:
+        raise ValueError("since must have a time zone")
 
 
 def _reference(response: Any) -> Reference:
@@ -33,8 +74,7 @@ async def undo_adoption(
         since: the time, with time zone, by the server's clock.
         timeout_s: deadline of each call.
     """
-    if since.tzinfo is None:
-        raise ValueError("since must have a time zone")
+    _check_zone(since)
     adopted = [it async for it in list_references(connection, scene, only_adopted=True, timeout_s=timeout_s)]
     chosen = [it for it in adopted if it.create_time >= since]
     for it in chosen:

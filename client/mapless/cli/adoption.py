@@ -28,10 +28,13 @@ def add_policy(command: argparse.ArgumentParser) -> None:
         group.add_argument(f"--adopt-{flag}", type=kind, metavar=unit, help=text)
 
 
-def policy_of(arguments: argparse.Namespace, current: AdoptionPolicy | None = None) -> AdoptionPolicy | None:
+def policy_of(
+    arguments: argparse.Namespace, current: AdoptionPolicy | None = None, is_arbitrary: bool = False
+) -> AdoptionPolicy | None:
     """The adoption policy that the flags give, with the `current` one's other values; None without `--adopt`.
 
-    ValueError for a value that is out of bounds, or without `--adopt`.
+    ValueError for a value that is out of bounds, or without `--adopt`; and without a radius for a scene whose unit is
+    arbitrary, for which there is no default.
     """
     given = {
         "most_per_place": arguments.adopt_most,
@@ -40,6 +43,8 @@ def policy_of(arguments: argparse.Namespace, current: AdoptionPolicy | None = No
         "min_surveyed_share": arguments.adopt_surveyed,
     }
     given = {name: value for name, value in given.items() if value is not None}
+    if arguments.adopt and is_arbitrary and current is None and arguments.adopt_radius is None:
+        raise ValueError("the scene's unit is arbitrary: give the largest 68 % radius in it, --adopt-radius")
     if arguments.adopt:
         return replace(current or AdoptionPolicy(), **given)
     if given:
@@ -60,10 +65,17 @@ def policy_text(policy: AdoptionPolicy | None, unit: str) -> str | None:
 
 def add_actions(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     """Adds the actions of references that undo what the server did by itself."""
-    restore = actions.add_parser("restore", help="have a retired one chosen again")
+    retire = actions.add_parser("retire", help="have one not chosen for photographs any more")
+    retire.add_argument("scene")
+    retire.add_argument("reference")
+    retire.set_defaults(run=retire_reference)
+    restore = actions.add_parser("restore", help="have a retired one chosen again, or all, or some")
     restore.add_argument("scene")
-    restore.add_argument("reference")
-    restore.set_defaults(run=restore_reference)
+    restore.add_argument("reference", nargs="?", default="")
+    restore.add_argument("--all", action="store_true", help="all retired ones of the scene")
+    restore.add_argument("--place", default="", metavar="REFERENCE", help="this surveyed one, and those adopted there")
+    restore.add_argument("--since", type=_time, metavar="TIME", help="those retired since, such as 2026-11-29, UTC")
+    restore.set_defaults(run=restore_references)
     undo = actions.add_parser("undo-adoption", help="delete those that were adopted since a time")
     undo.add_argument("scene")
     undo.add_argument(
@@ -81,8 +93,21 @@ def _time(text: str) -> datetime:
     return found.replace(tzinfo=timezone.utc) if found.tzinfo is None else found
 
 
-def restore_reference(client: Client, arguments: argparse.Namespace) -> int:
-    """Has a retired reference chosen again."""
+def retire_reference(client: Client, arguments: argparse.Namespace) -> int:
+    """Has a reference not chosen any more."""
+    found = client.retire_reference(arguments.scene, arguments.reference)
+    return show(arguments, found, [f"{found.reference_id} is not chosen for photographs any more"])
+
+
+def restore_references(client: Client, arguments: argparse.Namespace) -> int:
+    """Has retired references chosen again: one, all, or those of a place or since a time."""
+    is_some = arguments.all or bool(arguments.place) or arguments.since is not None
+    if bool(arguments.reference) == is_some:
+        raise ValueError("give one reference, or --all, or --place and --since or one of these")
+    if is_some:
+        ids = client.restore_references(arguments.scene, since=arguments.since, place=arguments.place)
+        number = f"{len(ids)} reference{'' if len(ids) == 1 else 's'} chosen for photographs again"
+        return show(arguments, ids, [number, *(f"  {it}" for it in ids)])
     found = client.restore_reference(arguments.scene, arguments.reference)
     return show(arguments, found, [f"{found.reference_id} is chosen for photographs"])
 

@@ -44,7 +44,7 @@ def create_scene(client: Client, arguments: argparse.Namespace) -> int:
         down_in_world=down,
         arbitrary_unit=is_arbitrary,
         labels=parse_labels(arguments.label),
-        adoption=policy_of(arguments),
+        adoption=policy_of(arguments, is_arbitrary=arguments.unit == "arbitrary"),
     )
     return show(arguments, scene, _scene_card(scene))
 
@@ -66,8 +66,10 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
         raise ValueError(f"{both[0]} is given, and to be forgotten")
     if not changes:
         raise ValueError("nothing to change: give --datum, --down, --unit, --label, --adopt or --forget")
-    if policy is not None and (current := client.get_scene(arguments.scene).adoption) is not None:
-        changes["adoption"] = policy_of(arguments, current)
+    if policy is not None:
+        there = client.get_scene(arguments.scene)
+        is_arbitrary = changes.get("arbitrary_unit", there.arbitrary_unit)
+        changes["adoption"] = policy_of(arguments, there.adoption, is_arbitrary)
     scene = client.update_scene(arguments.scene, **changes)
     _warn(scene.warnings)
     return show(arguments, scene, _scene_card(scene))

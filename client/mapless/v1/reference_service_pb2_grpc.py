@@ -106,10 +106,20 @@ class ReferenceServiceStub(object):
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceRequest.SerializeToString,
                 response_deserializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceResponse.FromString,
                 _registered_method=True)
+        self.RetireReference = channel.unary_unary(
+                '/mapless.v1.ReferenceService/RetireReference',
+                request_serializer=mapless_dot_v1_dot_reference__service__pb2.RetireReferenceRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_reference__service__pb2.RetireReferenceResponse.FromString,
+                _registered_method=True)
         self.RestoreReference = channel.unary_unary(
                 '/mapless.v1.ReferenceService/RestoreReference',
                 request_serializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceRequest.SerializeToString,
                 response_deserializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceResponse.FromString,
+                _registered_method=True)
+        self.RestoreReferences = channel.unary_unary(
+                '/mapless.v1.ReferenceService/RestoreReferences',
+                request_serializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferencesRequest.SerializeToString,
+                response_deserializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferencesResponse.FromString,
                 _registered_method=True)
         self.RetrieveReferences = channel.unary_unary(
                 '/mapless.v1.ReferenceService/RetrieveReferences',
@@ -230,9 +240,25 @@ class ReferenceServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def RetireReference(self, request, context):
+        """Has a reference not chosen for photographs any more, as the server does by itself where photographs contradict it; it stays
+        stored, and RestoreReference undoes it. One that is retired already is left as it is. Takes the role write.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def RestoreReference(self, request, context):
         """Has a retired reference chosen again (Reference.retire_time), and forgets what was held against it. One that is not
         retired is left as it is.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def RestoreReferences(self, request, context):
+        """The same for all retired references of a scene, of a place, or that were retired since a time, as one change. Takes the role
+        write.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -324,10 +350,20 @@ def add_ReferenceServiceServicer_to_server(servicer, server):
                     request_deserializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceRequest.FromString,
                     response_serializer=mapless_dot_v1_dot_reference__service__pb2.DeleteReferenceResponse.SerializeToString,
             ),
+            'RetireReference': grpc.unary_unary_rpc_method_handler(
+                    servicer.RetireReference,
+                    request_deserializer=mapless_dot_v1_dot_reference__service__pb2.RetireReferenceRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_reference__service__pb2.RetireReferenceResponse.SerializeToString,
+            ),
             'RestoreReference': grpc.unary_unary_rpc_method_handler(
                     servicer.RestoreReference,
                     request_deserializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceRequest.FromString,
                     response_serializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceResponse.SerializeToString,
+            ),
+            'RestoreReferences': grpc.unary_unary_rpc_method_handler(
+                    servicer.RestoreReferences,
+                    request_deserializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferencesRequest.FromString,
+                    response_serializer=mapless_dot_v1_dot_reference__service__pb2.RestoreReferencesResponse.SerializeToString,
             ),
             'RetrieveReferences': grpc.unary_unary_rpc_method_handler(
                     servicer.RetrieveReferences,
@@ -653,6 +689,33 @@ class ReferenceService(object):
             _registered_method=True)
 
     @staticmethod
+    def RetireReference(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.ReferenceService/RetireReference',
+            mapless_dot_v1_dot_reference__service__pb2.RetireReferenceRequest.SerializeToString,
+            mapless_dot_v1_dot_reference__service__pb2.RetireReferenceResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
     def RestoreReference(request,
             target,
             options=(),
@@ -669,6 +732,33 @@ class ReferenceService(object):
             '/mapless.v1.ReferenceService/RestoreReference',
             mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceRequest.SerializeToString,
             mapless_dot_v1_dot_reference__service__pb2.RestoreReferenceResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RestoreReferences(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/mapless.v1.ReferenceService/RestoreReferences',
+            mapless_dot_v1_dot_reference__service__pb2.RestoreReferencesRequest.SerializeToString,
+            mapless_dot_v1_dot_reference__service__pb2.RestoreReferencesResponse.FromString,
             options,
             channel_credentials,
             insecure,

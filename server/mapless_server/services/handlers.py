@@ -109,7 +109,7 @@ class Services:
             tracer=tracer,
         )
         self._watchers = Watchers(settings.allow_watching, settings.max_message_mib * 2**20)
-        self._references = ReferenceService(self._ready_engine, store)
+        self._references = ReferenceService(self._ready_engine, store, settings.capture_hours)
         self.handlers: dict[str, dict[str, grpc.RpcMethodHandler]] = {}
         self._localization = LocalizationService(self._ready_engine, metrics, store, self._watchers, recorder)
         reference_service_pb2_grpc.add_ReferenceServiceServicer_to_server(self._references, self)

@@ -47,11 +47,13 @@ from .messages.references import (
     changes_from_message,
     choice_to_message,
     implausible_depths,
+    kept_adopted,
     labels_from_message,
     nearly_ignored,
     new_provenance,
     outdated_places,
     reference_to_message,
+    restored_from_message,
     retired_to_message,
     scene_to_message,
 )
@@ -87,8 +89,12 @@ class Draft(NamedTuple):
 class ReferenceService(rpcs.ReferenceServiceServicer):
     """Stores scenes and their references."""
 
-    def __init__(self, engine: Callable[[], QueueEngine], store: Store) -> None:
-        """`engine` returns the engine; it raises Unavailable while the server starts."""
+    def __init__(self, engine: Callable[[], QueueEngine], store: Store, adopted_hours: float = 24.0) -> None:
+        """`engine` returns the engine; it raises Unavailable while the server starts.
+
+        Adopted references are deleted when they are `adopted_hours` old, which `UpdateScene` says.
+        """
+        self._adopted_hours = adopted_hours
         self._engine = engine
         self._store = store
         self._reach = Reach(store)
@@ -168,6 +174,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         warnings: list[str] = []
         if changes.keys() - {"calibration", "labels"}:
             warnings = await self._stored(self._contradictions, scene, MAX_COMPARED, call)
+        if changes.get("adoption") is not None:
+            warnings.append(kept_adopted(self._adopted_hours))
         return pb.UpdateSceneResponse(scene=scene_to_message(scene), warnings=warnings)
 
     def _contradictions(
@@ -280,6 +288,24 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     def _delete_reference(self, engine: QueueEngine, scene_key: SceneKey, reference_id: str) -> None:
         engine.forget_references({self._store.delete_reference(scene_key, reference_id)})
+
+    async def RetireReference(self, request: pb.RetireReferenceRequest, call: Call) -> pb.RetireReferenceResponse:
+        """Implements ReferenceService.RetireReference."""
+        from mapless_server.store import adoption
+
+        named = await self._reach.reference_key(call, request.name, "name")
+        record = await self._stored(adoption.retire_by_operator, self._store, *named)
+        return pb.RetireReferenceResponse(reference=reference_to_message(record))
+
+    async def RestoreReferences(self, request: pb.RestoreReferencesRequest, call: Call) -> pb.RestoreReferencesResponse:
+        """Implements ReferenceService.RestoreReferences."""
+        from mapless_server.store import adoption
+
+        scene_key = await self._reach.scene_key(call, request.scene, "scene")
+        since, place_id = restored_from_message(request, scene_id_of(scene_key))
+        restored = await self._stored(adoption.restore, self._store, scene_key, since, place_id)
+        made = [names.reference_name(scene_id_of(scene_key), it) for it in restored]
+        return pb.RestoreReferencesResponse(references=made)
 
     async def RestoreReference(self, request: pb.RestoreReferenceRequest, call: Call) -> pb.RestoreReferenceResponse:
         """Implements ReferenceService.RestoreReference."""

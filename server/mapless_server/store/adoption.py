@@ -20,7 +20,7 @@ from mapless.provenance import ADOPTED
 from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey
 
-from . import deletion, queries, rows
+from . import deletion, queries, retiring, rows
 from .database import Database
 from .records import Adopted, NewReference, ReferenceRecord, RetirementReason, Standing
 from .store import Store
@@ -279,10 +279,42 @@ def retire(store: Store, scene_key: SceneKey, keys: Sequence[str], reason: Retir
     with store.changing() as connection:
         generation = queries.begin_change(connection, scene_key)
         chosen = list(connection.scalars(of_scene.where(~queries.is_retired(column.key)).order_by(column.key)))
-        values = {"retire_time_us": rows.now_us(), "retire_reason": reason.value}
-        for key in chosen:
-            queries.insert_new(connection, reference_standing, {"reference_key": key})
-            row = update(reference_standing).where(reference_standing.c.reference_key == key)
-            connection.execute(row.values(values))
-        queries.note_removals(connection, scene_key, generation, chosen)
+        retiring.retire(connection, scene_key, generation, chosen, reason)
     return chosen
+
+
+def retire_by_operator(store: Store, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
+    """Has a reference not chosen any more, unless it is retired already; returns it as it is then.
+
+    NotFound if there is no such scene or reference.
+    """
+    with store.changing() as connection:
+        generation = queries.begin_change(connection, scene_key)
+        key = queries.find_key(connection, scene_key, reference_id)
+        if not retiring.retired_among(connection, [key]):
+            retiring.retire(connection, scene_key, generation, [key], RetirementReason.BY_OPERATOR)
+    return store.get_reference(scene_key, reference_id)
+
+
+def restore(store: Store, scene_key: SceneKey, since: datetime | None = None, place_id: str = "") -> list[str]:
+    """Has retired references of a scene chosen again, as one change; returns their ids, ordered.
+
+    Those that were retired at a time or later, and of the place of the surveyed reference with this id: itself, and
+    what was adopted there. NotFound if there is no such scene or reference.
+    """
+    column, standing = reference.c, reference_standing.c
+    retired = (
+        select(column.key, column.reference_id)
+        .join(reference_standing, standing.reference_key == column.key)
+        .where(column.scene_id == scene_key, standing.retire_time_us >= (0 if since is None else rows.time_us(since)))
+        .order_by(column.reference_id)
+    )
+    with store.changing() as connection:
+        generation = queries.begin_change(connection, scene_key)
+        if place_id:
+            place_key = queries.find_key(connection, scene_key, place_id)
+            here = select(adopted_reference.c.reference_key).where(adopted_reference.c.place_key == place_key)
+            retired = retired.where((column.key == place_key) | column.key.in_(here))
+        found = connection.execute(retired).all()
+        retiring.restore(connection, scene_key, generation, [it.key for it in found])
+    return [it.reference_id for it in found]

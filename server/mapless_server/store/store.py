@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, delete, insert, select, update
+from sqlalchemy import Connection, insert, select, update
 
 from mapless.geodesy import Datum
 from mapless.names import scene_name
@@ -22,7 +22,7 @@ from mapless_server.errors import AlreadyExists, DataLoss, NotFound, Overloaded
 from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, SceneLimit, scene_id_of
 
-from . import deletion, queries, rows, tables
+from . import deletion, queries, retiring, rows, tables
 from .database import DamagedPages, Database, with_room_to_delete
 from .deletion import PendingDeletions
 from .depth_images import encode_depth_image
@@ -380,19 +380,10 @@ class Store(StoreReader):
 
         NotFound if there is no such scene or reference.
         """
-        standing, removed, scene = tables.reference_standing, tables.removed_reference, tables.scene
         with self.changing() as connection:
             generation = queries.begin_change(connection, scene_key)
             key = queries.find_key(connection, scene_key, reference_id)
-            is_retired = select(queries.is_retired(tables.reference.c.key)).where(tables.reference.c.key == key)
-            if connection.scalar(is_retired):
-                connection.execute(delete(standing).where(standing.c.reference_key == key))
-                # Indexes never add a key again that they removed; so all of them read the whole scene.
-                connection.execute(delete(removed).where(removed.c.scene_id == scene_key))
-                its = update(scene).where(scene.c.scene_id == scene_key)
-                connection.execute(its.values(first_generation=generation))
-                again = update(tables.reference).where(tables.reference.c.key == key)  # for work in the background
-                connection.execute(again.values(generation=generation))
+            retiring.restore(connection, scene_key, generation, retiring.retired_among(connection, [key]))
         return self.get_reference(scene_key, reference_id)
 
     @observed

@@ -181,11 +181,15 @@ def check_prior_scene(request: pb.LocalizeRequest | pb.LocalizeRigRequest | pb.L
 
 def check_capture_time(message: Any) -> None:
     """Raises FieldError if the message's `capture_time` is no time: clients could not read it in the answer."""
-    time = message.capture_time
+    check_time(message.capture_time, "capture_time")
+
+
+def check_time(time: Any, field: str) -> None:
+    """Raises FieldError if a timestamp, in this field, is no time."""
     if not (FIRST_TIME_S <= time.seconds <= LAST_TIME_S and 0 <= time.nanos < 1_000_000_000):
         likely = "; are these milliseconds or nanoseconds?" if time.seconds > LAST_TIME_S else ""
         given = f"is {time.seconds} s and {time.nanos} ns{likely}"
-        raise FieldError("capture_time", f"must be a time of the years 1 to 9999, since 1970, {given}")
+        raise FieldError(field, f"must be a time of the years 1 to 9999, since 1970, {given}")
 
 
 def reference_count_from_message(message: pb.LocalizeOptions) -> int:

@@ -4,6 +4,7 @@ import base64
 import binascii
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime, timezone
 from typing import Any, TypeVar
 
 from mapless import names, wire
@@ -35,6 +36,7 @@ from mapless_server.store import (
 )
 
 from .enums import message_of
+from .queries import check_time
 
 DEFAULT_PAGE_SIZE = 100
 MAX_PAGE_SIZE = 1000
@@ -112,6 +114,7 @@ _RETIRED_BECAUSE = {
     RetirementReason.CONTRADICTED: "photographs from about its viewpoint do not show what it shows",
     RetirementReason.SURVEY_OUTDATED: "photographs of its place show too little of what was surveyed: survey it again",
     RetirementReason.VOUCHERS_GONE: "the surveyed references that its pose rests on were deleted or retired",
+    RetirementReason.BY_OPERATOR: "by request of a caller who may change the scene",
 }
 
 
@@ -134,6 +137,15 @@ def outdated_places(reference_ids: Sequence[str]) -> str:
     )
 
 
+def kept_adopted(hours: float) -> str:
+    """One sentence for a person that says how long adopted photographs are kept."""
+    days = f" ({hours / 24:g} days)" if hours > 48 else ""
+    return (
+        f"what it adopts is deleted {hours:g} h{days} after it was adopted, as captured calls are: see the server's "
+        "--capture-hours"
+    )
+
+
 def new_provenance(reference: pb.Reference, field: str) -> Provenance:
     """How the pose of a reference to be created is known; FieldError names what is wrong."""
     if not reference.HasField("provenance"):
@@ -144,6 +156,20 @@ def new_provenance(reference: pb.Reference, field: str) -> Provenance:
         raise FieldError(joined(path, "source"), f"must be one of PoseSource's values, is {message.source}")
     found = provenance_from_message(message, path)
     return found if message.source else replace(found, source=GIVEN)
+
+
+def restored_from_message(request: pb.RestoreReferencesRequest, scene_id: str) -> tuple[datetime | None, str]:
+    """Since when, and of which reference's place, retired ones are restored; FieldError names a wrong field."""
+    since = None
+    if request.HasField("since"):
+        check_time(request.since, "since")
+        since = request.since.ToDatetime(timezone.utc)
+    if not request.place:
+        return since, ""
+    its_scene_id, reference_id = wire.reference_ids_from_name(request.place, "place")
+    if its_scene_id != scene_id:
+        raise FieldError("place", f"{names.shown(request.place)} is a reference of another scene than {scene_id!r}")
+    return since, reference_id
 
 
 MUCH_IGNORED = 0.8
