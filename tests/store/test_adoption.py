@@ -10,6 +10,7 @@ from support.stores import Place, make_reference
 
 from mapless import AdoptionPolicy, Provenance
 from mapless_server.errors import AlreadyExists, NotFound
+from mapless_server.scenes.adoption.policy import AdoptionOptions, with_usefulness
 from mapless_server.store import RetirementReason, Store, adoption
 from mapless_server.store.pairs import PairStore, Progress
 from mapless_server.store.portions import IndexReader
@@ -76,6 +77,23 @@ def test_a_full_place_keeps_the_most_useful(place: Place) -> None:
         assert indexed(store) == ["a", "b", "y", "z"]
         with pytest.raises(AlreadyExists):  # which does not make room for itself
             adoption.adopt(store, HALL, adopted("y", 0.9), 2)
+
+
+def test_over_days_what_photographs_use_stays(place: Place) -> None:
+    """Each day three photographs match one of the place's two references, and a new photograph asks for room."""
+    options = AdoptionOptions()
+    with place.open() as store:
+        hall(store)
+        adoption.adopt(store, HALL, adopted("used", options.first_usefulness), 2)
+        for day in range(10):
+            adoption.adopt(store, HALL, adopted(f"of-day-{day}", options.first_usefulness), 2)
+            here = {it.reference_id: it for it in adoption.list_adopted(store.database, HALL)}
+            assert set(here) == {"used", f"of-day-{day}"}
+            for name, share in {"used": 0.3, f"of-day-{day}": 0.0}.items():
+                useful = here[name].usefulness
+                for _ in range(3):
+                    useful = with_usefulness(useful, share, options)
+                adoption.set_usefulness(store.database, {here[name].key: useful})
 
 
 def test_a_retired_reference_keeps_no_place_full(place: Place) -> None:

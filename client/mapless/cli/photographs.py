@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 from mapless_command.installation import how_to_install
@@ -183,18 +184,15 @@ def _add_priors(command: argparse.ArgumentParser) -> None:
         help="expected world_from_camera, and standard deviations of its position and rotation about each axis; "
         "makes the answer faster",
     )
-    group.add_argument(
+    add_three = partial(group.add_argument, type=float, nargs=3)
+    add_three(
         "--geo-position",
-        type=float,
-        nargs=3,
         metavar=("LATITUDE", "LONGITUDE", "METRES"),
         help="of a satellite receiver: WGS84 degrees, and standard deviation of north and of east; for scenes with a "
         "datum",
     )
-    group.add_argument(
+    add_three(
         "--gravity",
-        type=float,
-        nargs=3,
         metavar=("X", "Y", "Z"),
         help="down in the camera's axes (x right, y down, z forward), for scenes with a known down",
     )
