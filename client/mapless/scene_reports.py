@@ -1,7 +1,7 @@
 """Reports of a scene: how its photographs were answered, day by day and place by place, and what would help."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date, datetime, timezone
 from typing import Any
 
@@ -27,6 +27,9 @@ class PeriodCounts:
         position_68_m: typical 68 % radius of localized photographs, the geometric mean, metres or the scene's unit;
             None if none has one.
         inlier_count: mean number of matches that agree with the pose of localized photographs; None without any.
+        adoptions: of a scene, photographs that were considered as references by what became of them: "adopted", or why
+            they were not, as of the metric mapless_adoptions_total.
+        retirements: of a scene, references that servers retired by themselves, by why, as of mapless_retirements_total.
     """
 
     first_day: date
@@ -36,6 +39,8 @@ class PeriodCounts:
     surveyed_share: float | None = None
     position_68_m: float | None = None
     inlier_count: float | None = None
+    adoptions: Mapping[str, int] = field(default_factory=dict)
+    retirements: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def rejected_count(self) -> int:
@@ -195,6 +200,8 @@ def _period(message: pb.PeriodCounts) -> PeriodCounts:
         message.surveyed_share if message.localized_count else None,
         message.position_68_m or None,
         message.inlier_count if message.localized_count else None,
+        dict(message.adoptions),
+        dict(message.retirements),
     )
 
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from datetime import date, datetime, timezone
+from datetime import date
 
 import pytest
 from support.commands import run_client
@@ -10,7 +10,7 @@ from support.servers import RunningServer
 
 from mapless import AdoptionPolicy, Client
 from mapless_server.security import SceneKey
-from mapless_server.store import RetirementReason, Store, adoption, counts
+from mapless_server.store import Store, adoption, counts
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums
 
 Run = Callable[..., tuple[int, str, str]]
@@ -70,13 +70,14 @@ def test_a_bad_week_and_an_outdated_place_are_exit_codes(run: Run, aging: tuple[
     assert "the place has changed: survey it again" in " ".join(text.split())
 
 
-def test_what_was_retired_is_summed_by_reason(run: Run, aging: tuple[Store, str]) -> None:
+def test_what_was_adopted_and_retired_is_summed_by_reason(run: Run, aging: tuple[Store, str]) -> None:
     store, scene = aging
-    keys = store.find_keys(SceneKey(scene), ["r0", "r2"])
-    adoption.retire(store, SceneKey(scene), list(keys.values()), RetirementReason.CONTRADICTED)
-    today = datetime.now(timezone.utc).date()
-    _, text, _ = run(scene, "--text", "--since", LAST, "--until", today)
-    assert "retired  2 (2: photographs from about its viewpoint do not show what it shows)" in text
+    planted = {("adoptions", "adopted"): 3, ("adoptions", "nothing_new"): 5, ("retirements", "contradicted"): 2}
+    happened = {CountKey(TODAY, "", counts.happening(*it)): Sums(count) for it, count in planted.items()}
+    counts.add_counts(store.database, {SceneKey(scene): happened})
+    _, text, _ = run(scene, "--text", "--until", LAST)
+    shown = "adopted      3\nnot adopted  nothing_new 5\nretired      2 (contradicted 2)\n"
+    assert shown in text
 
 
 def test_programs_get_all_of_it(run: Run, aging: tuple[Store, str]) -> None:

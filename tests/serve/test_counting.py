@@ -24,7 +24,8 @@ from mapless_server.security import SceneKey
 from mapless_server.serve import counting
 from mapless_server.serve.counting import Counting, Noted
 from mapless_server.store import Store
-from mapless_server.store.counts import LOCALIZED
+from mapless_server.store.counts import DAY_US, LOCALIZED, read_report
+from mapless_server.store.rows import now_us
 
 HALL, YARD = SceneKey("hall"), SceneKey("yard")
 LOW = Rejection(RejectionReason.LOW_OVERLAP, "another place")
@@ -145,3 +146,21 @@ def test_photographs_wait_while_the_store_is_away(tmp_path: Path, monkeypatch: p
             asyncio.run(it.write())
         assert len(it._waiting) == 1
         asyncio.run(it.close())
+
+
+def test_what_is_adopted_or_retired_is_counted_in_its_scene(tmp_path: Path) -> None:
+    nothing: Any = None
+    metrics = Metrics()
+    with Store.open(tmp_path) as store:
+        store.create_scene(HALL)
+        it = Counting(nothing, store, metrics, 400)
+        for result in ("adopted", "adopted", "nothing_new"):
+            it.count_in_scene(HALL, "adoptions", 1, result)
+        it.count_in_scene(HALL, "retirements", 2, "contradicted")
+        it.count_in_scene(YARD, "adoptions", 1, "adopted")  # it was deleted
+        asyncio.run(it.write())
+        found = read_report(store.database, HALL, 0, now_us() // DAY_US, 9)
+    by_name = {what: count for (_, what), count in found.happened.items()}
+    assert by_name == {"adoptions:adopted": 2, "adoptions:nothing_new": 1, "retirements:contradicted": 2}
+    assert found.counts == {}
+    assert metrics.registry.get_sample_value("mapless_adoptions_total", {"result": "adopted"}) == 3

@@ -104,8 +104,8 @@ def report_text(report: SceneReport) -> list[str]:
     if outdated:
         more = f" and {len(outdated) - NAMED_PLACES} more" if len(outdated) > NAMED_PLACES else ""
         lines += ["", f"Places that need a new survey: {', '.join(outdated[:NAMED_PLACES])}{more}"]
-    if report.events:
-        lines += ["", *_events(report)]
+    if adoption := _adoption(report):
+        lines += ["", *adoption]
     if report.suggestions:
         lines += ["", "What would help most:"]
         for i, it in enumerate(report.suggestions[:SUGGESTIONS], 1):
@@ -168,8 +168,16 @@ def _worst(places: list[PlaceReport]) -> list[str]:
     return [*lines, f"and {more} more places"] if more > 0 else lines
 
 
-def _events(report: SceneReport) -> list[str]:
-    adopted = [it for it in report.events if it.kind == "ADOPTED"]
-    retired = Counter(it.message.partition(": ")[2] for it in report.events if it.kind == "RETIRED")
-    why = "; ".join(f"{count}: {reason}" for reason, count in retired.most_common())
-    return card(adopted=len(adopted) or None, retired=f"{retired.total()} ({why})" if retired else None)
+def _adoption(report: SceneReport) -> list[str]:
+    """Lines about what was adopted and retired, and why not; empty if nothing was considered."""
+    adoptions, retirements = Counter[str](), Counter[str]()
+    for it in report.periods:
+        adoptions.update(it.adoptions)
+        retirements.update(it.retirements)
+    adopted = adoptions.pop("adopted", 0)
+    considered = bool(adopted or adoptions)
+    return card(
+        adopted=adopted if considered else None,
+        **{"not adopted": reasons(adoptions) or None},
+        retired=f"{retirements.total()} ({reasons(retirements)})" if retirements else None,
+    )

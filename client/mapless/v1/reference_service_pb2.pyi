@@ -580,7 +580,21 @@ class SceneReport(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., first_day: _Optional[str] = ..., last_day: _Optional[str] = ..., periods: _Optional[_Iterable[_Union[PeriodCounts, _Mapping]]] = ..., places: _Optional[_Iterable[_Union[PlaceReport, _Mapping]]] = ..., omitted_place_count: _Optional[int] = ..., suggestions: _Optional[_Iterable[_Union[ReferenceSuggestion, _Mapping]]] = ..., events: _Optional[_Iterable[_Union[ReferenceEvent, _Mapping]]] = ..., arbitrary_unit: bool = ...) -> None: ...
 
 class PeriodCounts(_message.Message):
-    __slots__ = ("first_day", "last_day", "localized_count", "rejections", "surveyed_share", "position_68_m", "inlier_count")
+    __slots__ = ("first_day", "last_day", "localized_count", "rejections", "surveyed_share", "position_68_m", "inlier_count", "adoptions", "retirements")
+    class AdoptionsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+    class RetirementsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
     FIRST_DAY_FIELD_NUMBER: _ClassVar[int]
     LAST_DAY_FIELD_NUMBER: _ClassVar[int]
     LOCALIZED_COUNT_FIELD_NUMBER: _ClassVar[int]
@@ -588,6 +602,8 @@ class PeriodCounts(_message.Message):
     SURVEYED_SHARE_FIELD_NUMBER: _ClassVar[int]
     POSITION_68_M_FIELD_NUMBER: _ClassVar[int]
     INLIER_COUNT_FIELD_NUMBER: _ClassVar[int]
+    ADOPTIONS_FIELD_NUMBER: _ClassVar[int]
+    RETIREMENTS_FIELD_NUMBER: _ClassVar[int]
     first_day: str
     last_day: str
     localized_count: int
@@ -595,7 +611,9 @@ class PeriodCounts(_message.Message):
     surveyed_share: float
     position_68_m: float
     inlier_count: float
-    def __init__(self, first_day: _Optional[str] = ..., last_day: _Optional[str] = ..., localized_count: _Optional[int] = ..., rejections: _Optional[_Iterable[_Union[RejectionCount, _Mapping]]] = ..., surveyed_share: _Optional[float] = ..., position_68_m: _Optional[float] = ..., inlier_count: _Optional[float] = ...) -> None: ...
+    adoptions: _containers.ScalarMap[str, int]
+    retirements: _containers.ScalarMap[str, int]
+    def __init__(self, first_day: _Optional[str] = ..., last_day: _Optional[str] = ..., localized_count: _Optional[int] = ..., rejections: _Optional[_Iterable[_Union[RejectionCount, _Mapping]]] = ..., surveyed_share: _Optional[float] = ..., position_68_m: _Optional[float] = ..., inlier_count: _Optional[float] = ..., adoptions: _Optional[_Mapping[str, int]] = ..., retirements: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
 class RejectionCount(_message.Message):
     __slots__ = ("reason", "count")

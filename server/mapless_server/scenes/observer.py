@@ -1,5 +1,7 @@
 """Reports of background work ahead of queries, and of look-ups of its results, for metrics."""
 
+from mapless_server.security import SceneKey
+
 
 class BackgroundObserver:
     """Receives reports in any thread, and ignores them unless a method is overridden.
@@ -9,6 +11,10 @@ class BackgroundObserver:
 
     def count(self, name: str, amount: float = 1.0, result: str = "") -> None:
         """Adds a number of things, or seconds, to a count."""
+
+    def count_in_scene(self, scene_key: SceneKey, name: str, amount: int = 1, result: str = "") -> None:
+        """Adds to a count what happened in a scene; reports of scenes have it, too."""
+        self.count(name, amount, result)
 
     def waiting(self, name: str, count: int) -> None:
         """Sets how many things wait."""

@@ -6,6 +6,7 @@ Noting one takes microseconds. What waits when the process is killed is lost, an
 
 import asyncio
 import logging
+import math
 import time
 from collections import defaultdict, deque
 from collections.abc import Sequence
@@ -53,8 +54,8 @@ class Noted:
     scenes: Sequence[SceneQuestion] = ()
 
 
-class Counting:
-    """Counts the photographs of one server."""
+class Counting(BackgroundObserver):
+    """Counts the photographs of one server, and what becomes of those that are considered as references."""
 
     def __init__(self, engine: QueueEngine, store: Store, observer: BackgroundObserver, days: int) -> None:
         """Makes the object; counts are kept for so many days, `run` deletes older ones. With 0 nothing is counted."""
@@ -63,6 +64,8 @@ class Counting:
         self._observer = observer
         self._days = days
         self._waiting = deque[Noted]()
+        self._happened = deque[tuple[SceneKey, int, str, int]]()
+        """What happened in scenes: when, microseconds since 1970, and how often."""
 
     def note(self, parts: Sequence[tuple[Query, Result]], outcome: object, localization: object) -> None:
         """Remembers the photographs of an answer; called on the event loop.
@@ -81,6 +84,16 @@ class Counting:
                 sighting = sighting or _rejected(query, result, outcome)
                 self._waiting.append(Noted(scene_key, sighting, query.scenes))
 
+    def count(self, name: str, amount: float = 1.0, result: str = "") -> None:
+        """Implements BackgroundObserver."""
+        self._observer.count(name, amount, result)
+
+    def count_in_scene(self, scene_key: SceneKey, name: str, amount: int = 1, result: str = "") -> None:
+        """Implements BackgroundObserver."""
+        self._observer.count(name, amount, result)
+        if self._days and amount and len(self._happened) < MOST_WAITING:
+            self._happened.append((scene_key, now_us(), counts.happening(name, result), amount))
+
     async def run(self) -> None:
         """Writes what waits until it is cancelled, and deletes old counts; a failure is logged, and tried again."""
         tidied_s = -TIDY_S
@@ -96,15 +109,18 @@ class Counting:
                 log.warning("photographs could not be counted: %s", error)
             except Exception as error:  # must not end the counting
                 self._waiting.clear()
+                self._happened.clear()
                 log.error("photographs could not be counted, and are left out", exc_info=error)
 
     async def write(self) -> None:
         """Writes what waits, if there is anything; RequestError if the store is away, then it waits on."""
-        noted = list(self._waiting)
-        if noted:
-            await asyncio.to_thread(self._write, noted)
+        noted, happened = list(self._waiting), list(self._happened)
+        if noted or happened:
+            await asyncio.to_thread(self._write, noted, happened)
             for _ in noted:
                 self._waiting.popleft()
+            for _ in happened:
+                self._happened.popleft()
 
     async def close(self) -> None:
         """Writes what waits, after `run` was cancelled; what cannot be written is lost, and logged."""
@@ -113,17 +129,21 @@ class Counting:
         except RequestError as error:
             log.warning("%d photographs could not be counted: %s", len(self._waiting), error)
 
-    def _write(self, noted: Sequence[Noted]) -> None:
+    def _write(self, noted: Sequence[Noted], happened: Sequence[tuple[SceneKey, int, str, int]] = ()) -> None:
         of_scene = defaultdict[SceneKey, list[Noted]](list)
         for it in noted:
             of_scene[it.scene_key].append(it)
-        created_us = counts.scenes_created(self._store.database, of_scene)
+        created_us = counts.scenes_created(self._store.database, {*of_scene, *(it[0] for it in happened)})
         found = {
             # A photograph of a scene that was deleted, and made again, is not of the new one.
             key: self._counted(key, [it for it in its if it.sighting.time_us >= created_us[key]])
             for key, its in of_scene.items()
             if key in created_us
         }
+        for scene_key, time_us, outcome, amount in happened:
+            if time_us >= created_us.get(scene_key, math.inf):
+                its, key = found.setdefault(scene_key, {}), CountKey(time_us // DAY_US, "", outcome)
+                its[key] = its.get(key, Sums()) + Sums(photograph_count=amount)
         counts.add_counts(self._store.database, found)
 
     def _counted(self, scene_key: SceneKey, noted: Sequence[Noted]) -> dict[CountKey, Sums]:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from mapless_server.observability.metrics import Metrics
+from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import RateLimiter
 from mapless_server.settings import Settings
 from mapless_server.store import Store, StoreError
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MakeEngine = Callable[[Settings, Store, Metrics, "RateLimiter | None"], "QueueEngine"]
-MakeAdopter = Callable[["QueueEngine", Store, Metrics, float], "Adopter"]
+MakeAdopter = Callable[["QueueEngine", Store, BackgroundObserver, float], "Adopter"]
 """Makes what considers photographs as references, which keeps these for so many hours."""
 
 
@@ -53,8 +54,8 @@ def make_engine(settings: Settings, store: Store, metrics: Metrics, quota: RateL
     return engine
 
 
-def make_adopter(engine: QueueEngine, store: Store, metrics: Metrics, hours: float) -> Adopter:
+def make_adopter(engine: QueueEngine, store: Store, observer: BackgroundObserver, hours: float) -> Adopter:
     """Makes an adopter that goes by the clock of this machine; what it imports is loaded with the engine."""
     from .adoption.adopter import Adopter
 
-    return Adopter(engine, store, metrics, hours)
+    return Adopter(engine, store, observer, hours)

@@ -274,8 +274,8 @@ async def _start(
     await _warm_up(settings, engine, metrics)
     from .counting import Counting  # what it imports is loaded by now
 
-    adopter = adopting(engine, store, metrics, settings.capture_hours)
     counting = Counting(engine, store, metrics, settings.report_days)
+    adopter = adopting(engine, store, counting, settings.capture_hours)
     stack.push_async_callback(counting.close)
     _run_task(stack, counting.run())
     from .aging import watch_scenes

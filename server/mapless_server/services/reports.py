@@ -48,7 +48,7 @@ def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRe
         scene=names.scene_name(scene_id),
         first_day=period_to_message(periods[0]).first_day,
         last_day=period_to_message(periods[-1]).last_day,
-        periods=map(period_to_message, periods),
+        periods=[with_happened(period_to_message(it), it, stored.happened) for it in periods],
         omitted_place_count=max(0, len(places) - MOST_PLACES),
         arbitrary_unit=scene.attributes.arbitrary_unit,
     )
@@ -112,6 +112,16 @@ def period_to_message(period: Period) -> pb.PeriodCounts:
         position_68_m=radius_m,
         inlier_count=inlier_count,
     )
+
+
+def with_happened(message: pb.PeriodCounts, period: Period, happened: Mapping[tuple[int, str], int]) -> pb.PeriodCounts:
+    """The message of a scene's period with what became of photographs and references."""
+    fields = {"adoptions": message.adoptions, "retirements": message.retirements}
+    for (day, what), count in happened.items():
+        name, _, result = what.partition(":")
+        if period.first_day <= day <= period.last_day and name in fields:
+            fields[name][result] += count
+    return message
 
 
 def place_to_message(

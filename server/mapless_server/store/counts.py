@@ -26,6 +26,14 @@ LOCALIZED = "localized"
 """The outcome of a photograph that was localized; others are values of `RejectionReason`."""
 
 
+def happening(name: str, result: str) -> str:
+    """The outcome under which is counted what became of a photograph or a reference: no answer, and without a place."""
+    return f"{name}:{result}"
+
+
+_HAPPENED = ":"
+
+
 class CountKey(NamedTuple):
     """What photographs of a scene are counted by: the day since 1970, UTC, the place, empty if unknown, the outcome."""
 
@@ -117,12 +125,14 @@ class StoredReport:
     """What is stored of a scene's answers, read at one moment.
 
     Attributes:
-        counts: by what they are counted by, in no order.
+        counts: answered photographs by what they are counted by, in no order.
+        happened: what else happened, by day and `happening`.
         events: references that were adopted or retired, the last ones first.
         adopted: for each place with adopted references, by key, how many are in use and how many are retired.
     """
 
     counts: Mapping[CountKey, Sums]
+    happened: Mapping[tuple[int, str], int]
     events: Sequence[Event]
     adopted: Mapping[str, tuple[int, int]]
 
@@ -173,7 +183,9 @@ def read_report(
         places[place_key] = (used + (not is_retired), retired + is_retired)
     events = [it for it in events if first_day <= it.time_us // DAY_US <= last_day]
     events.sort(key=lambda it: (-it.time_us, it.reference_id))
-    return StoredReport(counts, events[:most_events], places)
+    happened = {(it.day, it.outcome): sums.photograph_count for it, sums in counts.items() if _HAPPENED in it.outcome}
+    counts = {it: sums for it, sums in counts.items() if _HAPPENED not in it.outcome}
+    return StoredReport(counts, happened, events[:most_events], places)
 
 
 def find_references(database: Database, scene_key: SceneKey, keys: Collection[str]) -> dict[str, ReferenceRecord]:
@@ -207,7 +219,7 @@ def busiest_scenes(database: Database, since_day: int, days: int, most: int) -> 
     ]
     found: Select[Any] = (
         select(column.scene_id, *numbers)
-        .where(column.day >= since_day - days)
+        .where(column.day >= since_day - days, ~column.outcome.contains(_HAPPENED))
         .group_by(column.scene_id)
         .having(numbers[0] > 0)
         .order_by(numbers[0].desc(), column.scene_id)

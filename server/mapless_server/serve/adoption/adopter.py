@@ -24,7 +24,7 @@ from mapless_server.method.judge.answer import Localization
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
 from mapless_server.scenes.observer import BackgroundObserver
-from mapless_server.security import Principal
+from mapless_server.security import Principal, SceneKey
 from mapless_server.store import NewReference, Store, adoption
 
 from .evidence import distance_shown, inliers_px, kept_query, keypoints_px, rival_count
@@ -84,7 +84,7 @@ class Adopter:
             return pb.ADOPTION_OFFER_SCENE_ADOPTS_NOTHING
         evidence, kept = self._localizer.evidence(query, result), kept_query(query, result, policy)
         if evidence is None or kept is None or not rules.is_certain(policy, evidence):
-            self._observer.count("adoptions", 1, "uncertain")
+            self._observer.count_in_scene(result.scene_key, "adoptions", 1, "uncertain")
             return pb.ADOPTION_OFFER_UNCERTAIN
         holder, now_s = rules.holder_of(principal), time.monotonic()
         candidate = Candidate(kept, evidence, inliers_px(result), distance_shown(result), holder, now_s)
@@ -144,11 +144,11 @@ class Adopter:
         options, scene_key = self._options or rules.AdoptionOptions(), candidate.query.scene_key
         policy = (await asyncio.to_thread(self._store.get_attributes, scene_key)).adoption
         if policy is None:
-            return self._counted(rules.Refusal.CHANGED)
+            return self._counted(scene_key, rules.Refusal.CHANGED)
         pose, distance_m = candidate.answered.world_from_camera, candidate.distance_m
         place = await asyncio.to_thread(self._localizer.place, scene_key, pose, distance_m, options)
         if place is None:
-            return self._counted(rules.Refusal.CHANGED)
+            return self._counted(scene_key, rules.Refusal.CHANGED)
         result = await self._localizer.localized(candidate.query, place.surveyed_ids, candidate.query.photo.mask)
         surveyed = self._localizer.evidence(candidate.query, result)
         is_outdated = await self._keeper.learn(candidate, place, surveyed, policy, self._now(), options)
@@ -161,10 +161,10 @@ class Adopter:
             refused = await self._adopt(candidate, place, surveyed, policy, options)
         if surveyed is not None and rules.is_certain(policy, surveyed):
             await self._keeper.count_contradictions(candidate, place, surveyed, result, self._now(), options)
-        return self._counted(refused)
+        return self._counted(scene_key, refused)
 
-    def _counted(self, refused: Refusal | None) -> Refusal | None:
-        self._observer.count("adoptions", 1, "adopted" if refused is None else refused.value)
+    def _counted(self, scene_key: SceneKey, refused: Refusal | None) -> Refusal | None:
+        self._observer.count_in_scene(scene_key, "adoptions", 1, "adopted" if refused is None else refused.value)
         return refused
 
     async def _refusal_by_pixels(

@@ -158,5 +158,5 @@ class Keeper:
         if not keys:
             return []
         retired = await asyncio.to_thread(adoption.retire, self._store, scene_key, keys, reason)
-        self._observer.count("retirements", len(retired), reason.value)
+        self._observer.count_in_scene(scene_key, "retirements", len(retired), reason.value)
         return retired
