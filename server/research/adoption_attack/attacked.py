@@ -10,7 +10,6 @@ from pathlib import Path
 
 from mapless import AdoptionPolicy, NewReference
 from mapless.aio import Client
-from mapless.axes import Axes
 from mapless.geometry import Camera, RigidTransform
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.wire import camera_to_message
@@ -20,9 +19,8 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scheduling import Flow
 from mapless_server.security import DEFAULT_TENANT, Principal, Role
 from mapless_server.serve.adoption.adopter import Adopter
-from mapless_server.serve.adoption.evidence import evidence_of
+from mapless_server.serve.adoption.surveyed import SurveyedLocalizer
 from mapless_server.serve.running import Running, running_server
-from mapless_server.services.messages.answers import AnswerFrames, outcome_to_message
 from mapless_server.services.messages.queries import query_from_message
 from mapless_server.settings import Settings, load_settings
 from mapless_server.store import SceneAttributes, Store
@@ -80,10 +78,9 @@ class Attacked:
         query = query_from_message(request, DEFAULT_TENANT, engine.options, SceneAttributes())
         caller = Caller(Flow(DEFAULT_TENANT, "attack"), time.monotonic() + LIMIT_S)
         result = await engine.run(engine.query_job(query, caller))
-        response = outcome_to_message(result, query.options, AnswerFrames(Axes.OPENCV, None), query.photo)
         if sender is not None:
-            self.adopter.offer(request, response, query, result, sender)
-        return evidence_of(response, result)
+            self.adopter.offer(request.options, query, result, sender)
+        return SurveyedLocalizer.evidence(query, result)
 
 
 def settings_of(data_dir: Path) -> Settings:
