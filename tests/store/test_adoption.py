@@ -227,8 +227,9 @@ def test_all_retired_ones_are_restored_or_some_of_them(place: Place) -> None:
         assert adoption.restore(store, HALL, since=later - timedelta(days=1)) == ["at b", "b"]
         assert sorted(indexed(store)) == ["a", "at a", "at b", "b"]
         assert adoption.restore(store, HALL) == []
-        with pytest.raises(NotFound):
+        with pytest.raises(NotFound) as caught:
             adoption.restore(store, HALL, place_id="gone")
+        assert caught.value.field == "place"
 
 
 def test_standings_are_counted_and_forgotten_when_restored(place: Place) -> None:

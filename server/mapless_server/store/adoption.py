@@ -312,7 +312,7 @@ def restore(store: Store, scene_key: SceneKey, since: datetime | None = None, pl
     with store.changing() as connection:
         generation = queries.begin_change(connection, scene_key)
         if place_id:
-            place_key = queries.find_key(connection, scene_key, place_id)
+            place_key = queries.find_key(connection, scene_key, place_id, "place")
             here = select(adopted_reference.c.reference_key).where(adopted_reference.c.place_key == place_key)
             retired = retired.where((column.key == place_key) | column.key.in_(here))
         found = connection.execute(retired).all()

@@ -212,12 +212,12 @@ def select_references() -> Select[Any]:
     return select(reference, *said).outerjoin(reference_standing, reference_standing.c.reference_key == reference.c.key)
 
 
-def find_key(connection: Connection, scene_key: SceneKey, reference_id: str) -> str:
-    """Key of one reference. Raises NotFound for the scene or the reference."""
+def find_key(connection: Connection, scene_key: SceneKey, reference_id: str, field: str = "name") -> str:
+    """Key of one reference, which a request has in this field. Raises NotFound for the scene or the reference."""
     read_generation(connection, scene_key)
     keys = find_keys(connection, scene_key, [reference_id])
     if reference_id not in keys:
-        raise reference_not_found(scene_key, reference_id, field="name")
+        raise reference_not_found(scene_key, reference_id, field=field)
     return keys[reference_id]
 
 
