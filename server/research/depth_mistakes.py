@@ -25,7 +25,8 @@ from mapless_server.method.structure.measured_depth import MeasuredDepth
 from mapless_tools.dataset import Frame
 from mapless_tools.ingest.formats.cameras import read_folder
 
-from .depth_places import MIN_VISIBLE, STEP, WRONG_SHARE
+from .depth_places import MIN_VISIBLE, STEP
+from .depth_tables import WRONG_SHARE
 
 SHIFT_SHARE = 20 / 640
 CAMERA_RATIO = 585 / 525

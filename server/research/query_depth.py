@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .depth_places import CACHE, WRONG_SHARE, DepthPlace, Outcome, ratio, written
+from .depth_places import CACHE, DepthPlace
+from .depth_tables import WRONG_SHARE, Outcome, ratio, written
 
 COUNTS = (2, 3, 5)
 

@@ -19,7 +19,8 @@ from mapless_server.serve.features import make_tiers
 from mapless_server.settings import load_settings
 from mapless_tools.ingest.formats.cameras import read_folder
 
-from ..depth_places import CACHE, SCALES, SENSORS, WRONG_SHARE, DepthFrames, known, posed, with_cache
+from ..depth_places import CACHE, SCALES, SENSORS, DepthFrames, known, posed, with_cache
+from ..depth_tables import WRONG_SHARE
 from .page import Measurement, Row
 
 FEATURES = ("edgepoint2-l64", "sift")
