@@ -1,5 +1,6 @@
 """Constants of the code name pages of evidence, and these name the constants, with the values that the code has."""
 
+import ast
 import importlib
 import operator
 import re
@@ -53,6 +54,22 @@ def test_a_page_states_the_values_that_the_code_has(path: Path) -> None:
         assert repr(operator.attrgetter(name)(found)) == value
     parts = ("**Question.**", "**Data.**", "**Command.**", "**Decision.**")
     assert [text.count(it) for it in parts] == [1, 1, 1, 1]
+
+
+def defaults_of(module: Path) -> set[str]:
+    """The names in default values of a module's functions, which are read when it is imported."""
+    found = [it for it in ast.walk(ast.parse(module.read_text())) if isinstance(it, ast.arguments)]
+    values = [value for it in found for value in (*it.defaults, *it.kw_defaults) if value is not None]
+    return {name.id for value in values for name in ast.walk(value) if isinstance(name, ast.Name)}
+
+
+def test_a_program_that_changes_a_constant_changes_what_is_used() -> None:
+    """A default value would keep the one in use while others are measured."""
+    for path in EVIDENCE:
+        for module, name, _ in STATED.findall(path.read_text()):
+            file = importlib.import_module(module).__file__
+            assert file is not None
+            assert name not in defaults_of(Path(file)), f"{path.stem}: {name} is a default value in {module}"
 
 
 def is_measured(key: str, text: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -164,6 +164,18 @@ def serve(folder: Path, queries: Floats, best: NDArray[np.intp], query_count: in
         not_found=not_found,
         still_found=still_found,
     )
+
+
+def by_rows(
+    folder: Path, queries: Floats, best: NDArray[np.intp], compared: Sequence[int]
+) -> Iterator[tuple[int, float, float]]:
+    """Searches that compare so many rows at least: the number, `Served.recall`, and the processor time of one, ms."""
+    with _indexes(folder, queries.shape[1]) as (_, indexes, _):
+        indexes.entries(SCENE, StageContext())
+        for count in compared:
+            begin_s = time.process_time()
+            recall = _recall(indexes, queries, best, count)
+            yield count, recall, 1000 * (time.process_time() - begin_s) / len(queries)
 
 
 def _recall(indexes: SceneIndexes, queries: Floats, best: NDArray[np.intp], compared: int | None) -> float:

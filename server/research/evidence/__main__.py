@@ -36,6 +36,7 @@ MODULES = {
     "rolling_shutter": ("rolling-shutter",),
     "depth_scores": ("depth-scores", "depth-radius"),
     "adopting": ("adoption-matches", "adoption-rivals", "adoption-contradictions"),
+    "retrieval_lists": ("retrieval-lists",),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }
 """The keys of each module, by its MEASUREMENTS; a module is imported when one of them is measured."""

@@ -52,9 +52,10 @@ class GlobalDescriptor(Protocol):
 Rows = NDArray[np.intp]
 
 CONSIDERED = 20_000
-"""Rows of an index file that a search compares, at least: the most similar lists that have so many."""
+"""Rows of an index file that a search compares, at least: the most similar lists that have so many. Evidence:
+retrieval-lists."""
 CONSIDERED_SHARE = 0.02
-"""The same as a share of all rows of the file; see decision 041."""
+"""The same as a share of all rows of the file. Evidence: retrieval-lists."""
 
 
 @dataclass(frozen=True, eq=False)
