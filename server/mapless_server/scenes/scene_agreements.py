@@ -10,7 +10,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -26,6 +26,7 @@ from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.pair import in_order
 from mapless_server.security import SceneKey
 from mapless_server.store import Store
+from mapless_server.store.adoption import list_adopted
 from mapless_server.store.pairs import Pair, PairStore
 
 from .agreement import Agreement, agreement_of
@@ -239,7 +240,9 @@ class SceneAgreements:
     def _derive(self, scene_key: SceneKey, known: _Known) -> None:
         begin_s = time.monotonic()
         stored = self._pairs.list_errors(self._matching, scene_key, READ_PAIRS)
-        errors_px = self._with_kept(known, stored)
+        # What the scene says of itself is what its survey says.
+        adopted = {it.key for it in list_adopted(self._store.database, scene_key)}
+        errors_px = self._with_kept(known, stored, adopted)
         found = agreement_of(errors_px)
         with self._guard:
             if known.rests_until_s > begin_s:  # nothing has changed meanwhile
@@ -249,7 +252,7 @@ class SceneAgreements:
         self._settle(scene_key, known, replace(found, same_pose=self._agreement(scene_key).same_pose))
         if len(stored) < ENOUGH_PAIRS:
             self._sample(scene_key, known, stored)
-            errors_px = self._with_kept(known, stored)
+            errors_px = self._with_kept(known, stored, adopted)
             found = agreement_of(errors_px)
         groups = self._explainer.same_poses(scene_key, errors_px) if found.agreeing_count < found.pair_count else []
         found = replace(found, same_pose=tuple(_some([it.text for it in groups])))
@@ -307,14 +310,14 @@ class SceneAgreements:
             known.measured = _Basis.of(agreeing)
             self._settle(scene_key, known, replace(found, median_depth=median_depth))
 
-    def _with_kept(self, known: _Known, stored: Mapping[Pair, float]) -> dict[Pair, float]:
-        """All errors that are known, of references that exist."""
+    def _with_kept(self, known: _Known, stored: Mapping[Pair, float], adopted: Set[str]) -> dict[Pair, float]:
+        """All errors that are known, of references that exist and are not adopted."""
         with self._guard:
             kept = {pair: it for pair, it in known.errors_px.items() if pair not in stored}
         keys = {key for pair in kept for key in pair} - {key for pair in stored for key in pair}
         existing = self._pairs.list_existing(keys) if keys else set()
-        gone = keys - existing
-        return {**stored, **{pair: it for pair, it in kept.items() if gone.isdisjoint(pair)}}
+        without = (keys - existing) | adopted
+        return {pair: it for pair, it in {**stored, **kept}.items() if without.isdisjoint(pair)}
 
     def _settle(self, scene_key: SceneKey, known: _Known, found: Agreement) -> None:
         """Makes a result known; an explanation that was found before remains while the scene contradicts itself.

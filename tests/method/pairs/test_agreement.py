@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from support.scenes import SceneOptions, make_scene, random_for
 
+from mapless.answers import Accuracy
 from mapless.geometry import RigidTransform, rotation_from_vector
+from mapless.provenance import Provenance
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.judge.references import (
     Supporters,
     disagreeing_references,
+    stated_px,
     with_contradiction,
     without_agreement,
 )
@@ -109,6 +112,20 @@ def test_a_pose_on_references_that_disagree_is_rejected() -> None:
     )
     assert disagreeing_references([Supporters(names, counts, lambda i, j: 99.0 if j == 3 else None)]) is None
     assert disagreeing_references([Supporters(names, counts, None)]) is None
+
+
+def test_errors_that_poses_state_are_tolerated() -> None:
+    """Two standard deviations of 1 cm, of references that look at what is 4 m away."""
+    names, counts, covariance = ["a", "b"], [90, 80], np.diag([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    known = Provenance(accuracy=Accuracy(0.01, 0.02, 0.0, 0.0), covariance=covariance.tolist())
+    stated = stated_px([replace(SCENE.references[0], provenance=known), SCENE.references[1]], 4.0)
+    camera = SCENE.references[0].view.camera
+    assert stated == [pytest.approx(camera.focal_x_px * 1024 / camera.width_px * 0.02 / 4.0), 0.0]
+    assert stated_px(SCENE.references, 4.0) == []
+    for error, is_tolerated in ((1.01 * MAX_ERROR_PX, True), (3 * (MAX_ERROR_PX + stated[0]), False)):
+        found = disagreeing_references([Supporters(names, counts, lambda i, j, it=error: it, stated)])  # type: ignore[misc]
+        assert (found is None) == is_tolerated
+    assert disagreeing_references([Supporters(names, counts, lambda i, j: 1.01 * MAX_ERROR_PX)]) is not None
 
 
 def test_in_a_contradicting_scene_two_references_must_agree() -> None:

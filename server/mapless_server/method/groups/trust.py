@@ -28,7 +28,7 @@ from ..judge.evidence import (
     votes_of,
 )
 from ..judge.judge import JudgeOptions, low_trust, trust_of
-from ..judge.references import Supporters, disagreeing_references
+from ..judge.references import Supporters, disagreeing_references, stated_px
 from ..pose.generalized import CameraMatches, rig_ransac
 from ..rejection import Rejection
 from .images import PosedImage
@@ -72,10 +72,11 @@ def _evidence_of(matched: Sequence[PosedImage]) -> Evidence:
 
 def supporters_of_group(matched: Sequence[PosedImage]) -> list[Supporters]:
     """The references that support the joint poses of photographs."""
-    found = []
+    found, distance_m = [], _distance_m(matched)
     for it in matched:
         names, error_px = [r.name for r in it.source.references], it.source.reference_error_px
-        found.append(Supporters(names, it.inliers_by_reference(), error_px))
+        stated = stated_px(it.source.references, distance_m)
+        found.append(Supporters(names, it.inliers_by_reference(), error_px, stated))
     return found
 
 

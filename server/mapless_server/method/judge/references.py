@@ -8,6 +8,7 @@ photographs of any place. They may take part in a pose, but the pose must be no 
 where they lie all over the image: the photograph shows the same as the reference, from the same place.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bundle.estimate import SUPPORTING_SHARE, PosedSupport, Support
+from ..features.limits import MAX_SIDE_PX
 from ..features.tracks import keypoint_offsets
 from ..features.views import PosedView, ReferenceErrors, View
 from ..pairs.agreement import MAX_ERROR_PX
@@ -38,27 +40,54 @@ class Supporters:
         names: their names.
         inlier_counts: for each, inliers of the pose that rest on it.
         error_px: returns the error of a pair of them; None if they were not matched with one another.
+        stated_px: for each, how far what it states of its pose's errors displaces what it shows, see `stated_px`; empty
+            if none states a covariance.
     """
 
     names: Sequence[str]
     inlier_counts: Sequence[int]
     error_px: ReferenceErrors | None
+    stated_px: Sequence[float] = ()
 
     def errors_px(self) -> list[float]:
-        """Errors of the pairs of those that a pose rests on most, as far as they are known."""
+        """Errors of the pairs of those that a pose rests on most, as far as they are known.
+
+        An error is made smaller by as much as what both state would make it larger than `MAX_ERROR_PX`.
+        """
         if self.error_px is None:
             return []
         least = max(MIN_INLIERS, SUPPORTING_SHARE * max(self.inlier_counts, default=0))
         used = [i for i, count in enumerate(self.inlier_counts) if count >= least]
         used = sorted(used, key=lambda i: -self.inlier_counts[i])[:MOST_REFERENCES]
-        found = (self.error_px(*sorted(pair)) for pair in combinations(used, 2))
-        return [it for it in found if it is not None]
+        found = {pair: self.error_px(*sorted(pair)) for pair in combinations(used, 2)}
+        return [it / self._tolerance(pair) for pair, it in found.items() if it is not None]
+
+    def _tolerance(self, pair: tuple[int, int]) -> float:
+        return math.hypot(1.0, *(self.stated_px[i] / MAX_ERROR_PX for i in pair)) if self.stated_px else 1.0
+
+
+def stated_px(references: Sequence[PosedView], distance_m: float) -> list[float]:
+    """How far errors of poses by two standard deviations displace what is at a distance, pixels of `MAX_SIDE_PX`.
+
+    0 for references without a covariance; empty if none has one.
+    """
+    if all(it.provenance.covariance is None for it in references):
+        return []
+    found = []
+    for it in references:
+        own = np.zeros((6, 6)) if it.provenance.covariance is None else np.array(it.provenance.covariance)
+        position_m, rotation = (2 * math.sqrt(np.linalg.eigvalsh(own[i : i + 3, i : i + 3])[-1]) for i in (0, 3))
+        camera = it.view.camera
+        focal_px = camera.focal_x_px * MAX_SIDE_PX / max(camera.width_px, camera.height_px)
+        found.append(focal_px * math.hypot(position_m / distance_m, rotation))
+    return found
 
 
 def supporters_of(support: PosedSupport) -> Supporters:
     """The references that support the estimate of a support."""
     names = [reference.name for reference in support.references]
-    return Supporters(names, support.inliers_by_reference(), support.reference_error_px)
+    stated = stated_px(support.references, support.distance_m())
+    return Supporters(names, support.inliers_by_reference(), support.reference_error_px, stated)
 
 
 def disagreeing_references(photographs: Sequence[Supporters]) -> Rejection | None:
