@@ -4,7 +4,7 @@ import socket
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import datetime, timezone
+from datetime import date, datetime, timezone
 from typing import Any
 from urllib.request import Request, urlopen
 
@@ -14,14 +14,17 @@ import pytest
 from support.images import encode
 from typer.testing import CliRunner
 
-from mapless import Datum, Quaternion, Reference, Scene
+from mapless import Datum, Quaternion, Reference, Scene, Unavailable
 from mapless.answers import Accuracy, Hint, Hypothesis, LocalizationResult, Rejected
 from mapless.diagnostics import Debug, Diagnostics, ReferenceUse
 from mapless.geometry import Camera, RigidTransform, rotation_from_vector
+from mapless.scene_reports import PeriodCounts, PlaceReport, ReferenceSuggestion, RejectedPosition, SceneReport
 from mapless_tools.cli.app import app
 from mapless_tools.depth_points import ColouredPoints
 from mapless_tools.matches import colours_at, read_picture
-from mapless_tools.view.drawing import ellipsoid
+from mapless_tools.report.places import BAD, GOOD, places_of, reason_colour
+from mapless_tools.view.drawing import Drawing, ellipsoid, rgb
+from mapless_tools.view.failures import MOST_POINTS, NOTHING_COUNTED, Failures, rejection_points
 from mapless_tools.view.feed import Query
 from mapless_tools.view.scenery import lay_out, spread_out
 
@@ -256,3 +259,80 @@ def test_queries_of_every_outcome_come_and_go() -> None:
     assert {it for it in names if it.endswith("/right")} == {
         f"/queries/{number}/right" for number in kept if number % 4 == 1
     }
+
+
+def reported(name: str, pose: RigidTransform, localized: int, rejections: dict[str, int]) -> PlaceReport:
+    days = date(2026, 11, 24), date(2026, 11, 30)
+    return PlaceReport(name, pose, (PeriodCounts(*days, localized, rejections),))
+
+
+class TestFailures:
+    """The layer of a report: r0 is good, r1 bad with its photographs 9 m beyond, where a suggestion is."""
+
+    BEYOND = (4e5 + 10.0, 5e6, 30.0)
+
+    @pytest.fixture
+    def report(self) -> SceneReport:
+        places = reported("r0", upright(0), 9, {}), reported("r1", upright(1), 1, {"GATE": 2, "LOW_OVERLAP": 60})
+        where = RejectedPosition(62, self.BEYOND, None, 0.5)
+        suggested = ReferenceSuggestion("r1", 60.0, self.BEYOND, (0.0, 1.0, 0.0), 9.0, "look <here>")
+        period = PeriodCounts(date(2026, 11, 24), date(2026, 11, 30), 10, {"LOW_OVERLAP": 60, "GATE": 2}, 1.0)
+        both = places[0], replace(places[1], rejected_position=where)
+        return SceneReport("hall", period.first_day, period.last_day, (period,), both, 0, (suggested,))
+
+    def test_rejections_are_points_by_reason_where_they_were(self, report: SceneReport) -> None:
+        points, colours = rejection_points(places_of(report, []), 0.3)
+        np.testing.assert_allclose(points.mean(axis=0), self.BEYOND, atol=0.1)
+        assert len(points) == MOST_POINTS
+        of_reason = {tuple(it) for it in colours.tolist()}
+        assert of_reason == {rgb(reason_colour("GATE")), rgb(reason_colour("LOW_OVERLAP"))}
+
+    def test_it_is_drawn_on_demand_of_the_weeks_chosen(self, report: SceneReport) -> None:
+        pytest.importorskip("viser", reason="needs the extra view")
+        from mapless_tools.view.guarded import GuardedViser
+
+        asked: list[int] = []
+
+        def read(weeks: int) -> SceneReport:
+            asked.append(weeks)
+            if weeks == 52:
+                raise Unavailable("UNAVAILABLE", "the server <is> away")
+            period = replace(report.periods[0], localized_count=0, rejections={})
+            return report if weeks == 4 else replace(report, periods=(period,), places=(), suggestions=())
+
+        server = GuardedViser("127.0.0.1", 0, "test")
+        try:
+            scenery = lay_out(SCENE, [reference(i, upright(i)) for i in range(3)], 3)
+            layer = Failures(server, Drawing(server, scenery), scenery, read)
+            handles: dict[str, Any] = server.scene._handle_from_node_name
+            layer.update()
+            assert not asked
+            assert not [it for it in handles if it.startswith("/what-fails")]
+            self.choose(layer, show=True)
+            shown = {name: it for name, it in handles.items() if name.startswith("/what-fails/")}
+            places = shown["/what-fails/places"]
+            np.testing.assert_allclose(places.points, [scenery.placed(upright(i)).translation for i in (0, 1)])
+            assert [tuple(it) for it in places.colors.tolist()] == [rgb(GOOD), rgb(BAD)]
+            start, end = shown["/what-fails/suggestion-1"].points[0]
+            np.testing.assert_allclose(start, np.array(self.BEYOND) - scenery.origin)
+            assert end[1] > start[1]
+            assert shown["/what-fails/suggestion-1-label"].text == "1"
+            assert "look &lt;here&gt;" in layer.legend.content
+            self.choose(layer, show=False)
+            assert not any(it.visible for it in shown.values())
+            self.choose(layer, show=True)
+            assert asked == [4]
+            self.choose(layer, show=True, weeks="1 week")
+            assert NOTHING_COUNTED in layer.legend.content
+            assert not [it for it in handles if it.startswith("/what-fails/")]
+            self.choose(layer, show=True, weeks="52 weeks")
+            assert "the server &lt;is&gt; away" in layer.legend.content
+        finally:
+            server.stop()
+
+    def choose(self, layer: Failures, *, show: bool, weeks: str = "") -> None:
+        """Sets the box or the weeks as a browser does; here they call nothing by themselves."""
+        setattr(layer.show, "value", show)  # noqa: B010 - its type says that it is only read
+        if weeks:
+            setattr(layer.weeks, "value", weeks)  # noqa: B010 - likewise
+        layer.update(again=bool(weeks))

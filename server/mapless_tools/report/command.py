@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -42,11 +42,15 @@ def report_command(
     if since is not None and until is not None and since > until:
         fail(f"--since {since:%Y-%m-%d} is after --until {until:%Y-%m-%d}")
     with failures_end_command(ValueError):
+        from .asking import report_of_weeks
+
         check_writable(html)
         with terminable(), connected(connection, load_settings({}).settings) as client:
-            last = until.date() if until else client.get_scene_report(scene, days_per_period=1).last_day  # by its clock
-            first = since.date() if since else last - timedelta(days=7 * weeks - 1)
-            report = client.get_scene_report(scene, first_day=first, last_day=last)
+            last = until.date() if until is not None else None
+            if since is None:
+                report = report_of_weeks(client, scene, weeks, last)
+            else:
+                report = client.get_scene_report(scene, first_day=since.date(), last_day=last)
             known = client.get_scene(scene)
             references = list(islice(client.list_references(scene), MOST_DRAWN))
         from .page import report_page

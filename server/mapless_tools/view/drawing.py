@@ -74,12 +74,13 @@ MAX_RAYS = 90
 """Lines from a query to its points; more hide what they lead to."""
 
 
-def _rgb(colour: str) -> Colour:
+def rgb(colour: str) -> Colour:
+    """Red, green and blue, 0 to 255, of a colour such as "#2f7bd0"."""
     red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue
 
 
-BY_DEPTH = _rgb(SOURCE_COLOURS["MEASURED_DEPTH"][1])
+BY_DEPTH = rgb(SOURCE_COLOURS["MEASURED_DEPTH"][1])
 """Colour of lines to points by depth, and tint of these."""
 
 
@@ -136,6 +137,24 @@ class Drawing:
             visible=visible,
         )
 
+    def arrow(self, name: str, label: str, position: Array, forward: Array, size: float) -> list[Any]:
+        """Draws an arrow from a position (3,), world, along a unit vector, with a label at its beginning.
+
+        It is `size` times as long as the scenery's cameras.
+        """
+        length = size * self._scenery.size_m
+        start = position - self._scenery.origin
+        ends = np.stack([start, start + length * forward])[None]
+        shown = self._scene.add_arrows(
+            name,
+            ends,
+            SELECTED,
+            shaft_radius=0.03 * length,
+            head_radius=0.09 * length,
+            head_length=0.25 * length,
+        )
+        return [shown, self._scene.add_label(f"{name}-label", label, position=tuple(start.tolist()))]
+
     def support(self, name: str, answer: LocalizationResult) -> list[Any]:
         """Draws a pose's 95 % ellipsoid, and lines to the matched points."""
         return self._ellipsoid(name, answer) + self._rays(name, answer)
@@ -168,9 +187,9 @@ class Drawing:
         points, right = answer.debug.x_in_world - self._scenery.origin, answer.debug.is_inlier
         by_depth, drawn = answer.debug.is_by_depth, []
         for kind, rows, colour, count in (
-            ("right", right & ~by_depth, _rgb(GOOD), MAX_RAYS),
+            ("right", right & ~by_depth, rgb(GOOD), MAX_RAYS),
             ("right-by-depth", right & by_depth, BY_DEPTH, MAX_RAYS),
-            ("wrong", ~right, _rgb(WRONG), MAX_RAYS // 4),
+            ("wrong", ~right, rgb(WRONG), MAX_RAYS // 4),
         ):
             lines = rays(centre, points[rows], count, longest_m)
             if len(lines):

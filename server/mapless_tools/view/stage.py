@@ -56,12 +56,12 @@ class Stage:
     def __init__(self, server: GuardedViser, scenery: Scenery, title: str, open_photo: Callable[[str], bytes]) -> None:
         """Draws the references, at first without their photographs, which `open_photo` returns by their ids."""
         self._server, self._scenery, self._open_photo = server, scenery, open_photo
-        self._drawing = Drawing(server, scenery)
+        self.drawing = Drawing(server, scenery)
         self._lock = threading.Lock()
         self._shown: deque[_Shown] = deque()
         self._selected: _Shown | None = None
-        self._points = Cloud(self._drawing, "/points", scenery.extent_m)
-        self._depth_points = Cloud(self._drawing, "/points-by-depth", scenery.extent_m)
+        self._points = Cloud(self.drawing, "/points", scenery.extent_m)
+        self._depth_points = Cloud(self.drawing, "/points-by-depth", scenery.extent_m)
         self._depths: list[Any] = []
         pictured = [(int(i), scenery.references[i]) for i in scenery.pictured]
         self._references = {it.reference_id: self._draw_reference(i, it) for i, it in pictured}
@@ -91,7 +91,7 @@ class Stage:
         with self._lock:
             name = f"/depth/{len(self._depths)}-{reference_id}"
             visible = self._show_depths.value
-            self._depths.append(self._drawing.points(name, placed, tinted(found.colours), size_m, visible))
+            self._depths.append(self.drawing.points(name, placed, tinted(found.colours), size_m, visible))
 
     def show_query(self, query: Query) -> None:
         """Adds a query, and selects it."""
@@ -154,7 +154,7 @@ class Stage:
 
     def _draw_reference(self, index: int, reference: Reference) -> Any:
         name, pose = f"/references/{index}", reference.world_from_camera
-        handle = self._drawing.camera(name, reference.camera, pose, REFERENCE, 1.0)
+        handle = self.drawing.camera(name, reference.camera, pose, REFERENCE, 1.0)
         handle.on_click(lambda event: self._open_reference(reference, event.client))
         return handle
 
@@ -165,7 +165,7 @@ class Stage:
             return []
         centres = np.stack([scenery.placed(scenery.references[i].world_from_camera).translation for i in others])
         colour = np.array(OTHER, np.uint8)
-        return [self._drawing.points("/other-references", centres, colour, 0.15 * scenery.size_m, True)]
+        return [self.drawing.points("/other-references", centres, colour, 0.15 * scenery.size_m, True)]
 
     def _draw_query(self, shown: _Shown) -> None:
         query, answer, name = shown.query, shown.query.answer, f"/queries/{shown.query.number}"
@@ -174,10 +174,10 @@ class Stage:
             poses = [it.world_from_camera for it in answer.hypotheses]
         else:
             poses = [answer.world_from_camera]
-            shown.support = self._drawing.support(name, answer)
+            shown.support = self.drawing.support(name, answer)
         size = _QUERY_SIZE * float(self._size.value)
         shown.frustums = [
-            self._drawing.camera(f"{name}/camera-{i}", query.camera, pose, QUERY, size, picture)
+            self.drawing.camera(f"{name}/camera-{i}", query.camera, pose, QUERY, size, picture)
             for i, pose in enumerate(poses)
         ]
 

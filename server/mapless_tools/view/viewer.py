@@ -15,7 +15,9 @@ from mapless import Scene as KnownScene
 from mapless_server.errors import InvalidArgument
 from mapless_tools.depth_points import depth_points, share_of
 from mapless_tools.matches import colours_at, read_picture
+from mapless_tools.report.asking import report_of_weeks
 
+from .failures import Failures
 from .feed import THUMBNAIL_PX, Feed, Query
 from .guarded import GuardedViser
 from .scenery import Scenery, lay_out
@@ -50,6 +52,7 @@ def viewer(
         server = GuardedViser(host, port, f"mapless: {scene}")
         stack.callback(server.stop)
         stage = Stage(server, scenery, scene, open_photo)
+        Failures(server, stage.drawing, scenery, partial(report_of_weeks, client, scene))
         work = _Background(client, known, scenery, stage)
         stack.callback(work.close)
         feed = Feed(address, connect, scene, work.show_query, stage.report)
