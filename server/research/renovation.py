@@ -144,7 +144,8 @@ def seen_of(frame: Frame, answer: LocalizationResult | Rejected, survey_left: fl
     """How a photograph was answered."""
     surveyed, right = right_matches(frame, answer)
     if isinstance(answer, Rejected):
-        return Seen(frame.name, survey_left, surveyed, right, rejection=f"{answer.reason}: {answer.message}")
+        said, place = f"{answer.reason}: {answer.message}", answer.outdated_place.rpartition("/")[2]
+        return Seen(frame.name, survey_left, surveyed, right, rejection=said, outdated_place=place)
     error_m = pose_error(frame.world_from_camera, answer.world_from_camera)[0]
     accuracy = answer.accuracy
     radii = (0.0, 0.0) if accuracy is None else (accuracy.position_68_m, accuracy.position_95_m)
