@@ -264,6 +264,18 @@ def test_a_place_with_too_little_survey_left_is_named(held: Held) -> None:
     assert held.client.get_scene("room").warnings == ()
 
 
+def test_an_uncertain_photograph_says_how_much_survey_is_left(held: Held) -> None:
+    held.client.update_scene("room", adoption=replace(POLICY, max_radius_m=1e-4))
+    answer = held.client.localize(held.place.queries[0].data, held.place.queries[0].camera, "room", allow_adoption=True)
+    assert not isinstance(answer, Rejected)
+    assert answer.diagnostics.adoption == "UNCERTAIN"
+    candidate = held.adopter.take()
+    assert candidate is not None
+    assert held.consider(candidate) is Refusal.UNCERTAIN
+    (place, *_) = [it.place for it in held.client.list_references("room") if it.place is not None]
+    assert (place.surveyed_share, place.photograph_count) == (pytest.approx(1.0, abs=0.1), 1)
+
+
 def test_a_contradicted_reference_is_retired_and_restored(held: Held) -> None:
     """It stands where a photograph was taken, and shows something else than the photograph."""
     query, now = held.place.queries[0], datetime.now(timezone.utc)
@@ -380,6 +392,7 @@ def test_an_answer_says_why_nothing_is_kept(held: Held, monkeypatch: pytest.Monk
     assert client.localize(_noise(), query.camera, "room", allow_adoption=True).diagnostics.adoption == "NOT_LOCALIZED"
     client.update_scene("room", adoption=replace(POLICY, max_radius_m=1e-5))
     assert said() == "UNCERTAIN"
+    held.taken()  # what it says of its place counts
     client.update_scene("room", adoption=None)
     assert said() == "SCENE_ADOPTS_NOTHING"
     client.update_scene("room", adoption=POLICY)

@@ -83,12 +83,14 @@ class Adopter:
         if policy is None:
             return pb.ADOPTION_OFFER_SCENE_ADOPTS_NOTHING
         evidence, kept = self._localizer.evidence(query, result), kept_query(query, result, policy)
-        if evidence is None or kept is None or not rules.is_certain(policy, evidence):
+        if evidence is None or kept is None:
             self._observer.count_in_scene(result.scene_key, "adoptions", 1, "uncertain")
             return pb.ADOPTION_OFFER_UNCERTAIN
         holder, now_s = rules.holder_of(principal), time.monotonic()
         candidate = Candidate(kept, evidence, inliers_px(result), distance_shown(result), holder, now_s)
         self._observer.count("adoptions", self._waiting.add(candidate), "queue")
+        if not rules.is_certain(policy, evidence):  # it is considered for what it says of its place
+            return pb.ADOPTION_OFFER_UNCERTAIN
         return pb.ADOPTION_OFFER_WAITING if candidate in self._waiting else pb.ADOPTION_OFFER_QUEUE_FULL
 
     async def run(self) -> None:
