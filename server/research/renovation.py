@@ -4,7 +4,7 @@ Renders into FOLDER what it lacks (15 minutes of processor time), stores the sur
 own with the settings of the environment, and localizes 40 photographs at each step, which is renovated further each
 time (`rendered_room/renovation.py`). A step is a week. After the ten steps the surfaces of the building are exchanged
 too, and then the room is surveyed again. All of it twice: without adoption, and with a scene that adopts, where each
-photograph is considered before the next one. Prints Markdown, of which `docs/evidence/renovation.md` consists.
+photograph is considered before the next one. Prints Markdown, or writes it to `docs/results/renovation.md`.
 
 What is left of the survey where a photograph was taken is known from the room's geometry: the share of the surveyed
 points in its view whose surface was neither exchanged nor hidden.
@@ -29,18 +29,21 @@ from mapless_tools.evaluate.run import await_features
 from mapless_tools.ingest.formats.cameras import read_folder
 
 from .adopting_server import Calendar, MetricsPage, adopting_server
+from .evidence.page import measured_commit
 from .rendered_room.folders import entry_of, write_cameras, write_photograph
 from .rendered_room.photographs import Station
 from .rendered_room.renovation import STEPS, RenovatedRoom, Renovation, survey, visit
 from .rendered_room.survey_left import SurveyedPoints
-from .renovation_tables import Seen, StepResult, report
+from .renovation_tables import Seen, StepResult, report, with_section
 
 SCENE = "renovated"
 PHOTOGRAPHS = 40
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "renovation.md"
 RIGHT_PX = 4.0
 """Farthest projection of the point of a right match, by the true pose, pixels of the photograph."""
-BUILDING, SURVEYED_AGAIN = STEPS + 1, STEPS + 2
-"""The steps after the ten: the building's surfaces are exchanged, and the same room is surveyed again."""
+BUILDING, WEEK_LATER, SURVEYED_AGAIN = STEPS + 1, STEPS + 2, STEPS + 3
+"""The steps after the ten: the building's surfaces are exchanged, the same room a week later, and after a new survey,
+when the photographs of the first of these weeks are asked for again."""
 DAYS = 7.0
 """Length of a step."""
 
@@ -48,13 +51,13 @@ DAYS = 7.0
 def render(folder: Path, seed: int, count: int) -> None:
     """Renders surveys and steps where they are missing."""
     renovation = Renovation(seed)
-    for step in range(SURVEYED_AGAIN + 1):
+    for step in range(WEEK_LATER + 1):
         target = folder / f"step-{step:02d}"
         if (target / "share").is_file():
             continue
         room = renovation.at(min(step, BUILDING))
         write(target, room, visit(seed, step, count, room))
-        if step in (0, SURVEYED_AGAIN):
+        if step in (0, BUILDING):
             write(folder / ("survey" if step == 0 else "survey-again"), room, survey(seed, room))
         (target / "share").write_text(str(1 - float(np.mean(room.exchanged))))
         print(f"step {step} rendered", file=sys.stderr, flush=True)
@@ -78,7 +81,8 @@ class Run:
     def __init__(self, folder: Path, seed: int, count: int) -> None:
         """Prepares the photographs in a folder, so many of each step."""
         self._folder = folder
-        self._frames = [frames_of(folder, step, count) for step in range(SURVEYED_AGAIN + 1)]
+        self._frames = [frames_of(folder, step, count) for step in range(WEEK_LATER + 1)]
+        self._frames.append(self._frames[BUILDING])
         self._surveyed = SurveyedPoints(seed, read_folder(folder / "survey").frames)
 
     def steps(self, client: Client, metrics: MetricsPage, calendar: Calendar, adopts: bool) -> list[StepResult]:
@@ -111,7 +115,7 @@ class Run:
         )
         if metrics is not None and not isinstance(answer, Rejected):
             metrics.wait_for(before + 1)
-        left = 1.0 if step == SURVEYED_AGAIN else self._surveyed.left(step, frame)
+        left = 1.0 if step == SURVEYED_AGAIN else self._surveyed.left(min(step, BUILDING), frame)
         return seen_of(frame, answer, left)
 
     def _result(self, client: Client, metrics: MetricsPage, step: int, seen: Sequence[Seen]) -> StepResult:
@@ -123,7 +127,7 @@ class Run:
                 held += errors[-1] <= kept.provenance.accuracy.position_95_m
         result = StepResult(
             step,
-            float((self._folder / f"step-{step:02d}" / "share").read_text()),
+            float((self._folder / f"step-{min(step, WEEK_LATER):02d}" / "share").read_text()),
             tuple(seen),
             tuple(errors),
             held,
@@ -181,13 +185,17 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=0, help="of the room and its renovation")
     parser.add_argument("--photographs", type=int, default=PHOTOGRAPHS, help="of each step, the same ones first")
+    parser.add_argument("--page", action="store_true", help=f"write the tables to {PAGE.name} instead")
     parser.add_argument("--only", choices=("without", "with"), help="measure without adoption alone, or with it")
     arguments = parser.parse_args()
     folder, seed, count = arguments.folder, arguments.seed, arguments.photographs
     render(folder, seed, count)
-    for adopts in (False, True):
-        if arguments.only in (None, "with" if adopts else "without"):
-            print(report(measure(folder, seed, count, adopts), adopts=adopts), end="\n\n", flush=True)
+    runs = [it for it in (False, True) if arguments.only in (None, "with" if it else "without")]
+    reports = [report(measure(folder, seed, count, adopts), adopts=adopts) for adopts in runs]
+    if arguments.page:
+        PAGE.write_text(with_section(PAGE.read_text(), seed, measured_commit(), reports))
+    else:
+        print("\n\n".join(reports))
 
 
 if __name__ == "__main__":

@@ -2,10 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 
 import numpy as np
 
 from mapless_tools.output_files import markdown_table
+
+from .rendered_room.renovation import STEPS
 
 ENOUGH_LEFT = 0.3
 """Share of the surveyed points in view from which on a photograph is to be localized."""
@@ -79,9 +82,11 @@ class StepResult:
 
 
 def report(results: Sequence[StepResult], *, adopts: bool) -> str:
-    """The tables of a run."""
+    """A run's summary and tables."""
     first = float(np.mean([it.surveyed_matches for it in results[0].seen]))
-    lines = markdown_table(ANSWERS, [_answers(it, first) for it in results])
+    title = "With adoption" if adopts else "Without adoption"
+    lines = [f"### {title}", "", *_summary(results), ""]
+    lines += markdown_table(ANSWERS, [_answers(it, first) for it in results])
     if adopts:
         before = [None, *results[:-1]]
         lines += ["", *markdown_table(ADOPTED, [_adopted(it, last) for it, last in zip(results, before, strict=True)])]
@@ -100,6 +105,38 @@ ADOPTED = (
 )
 LOST = "step | photograph | survey left | right matches | of them surveyed | "
 LOST += "error | 95 % radius | rejected"
+
+
+def _summary(results: Sequence[StepResult]) -> list[str]:
+    """The figures of the bar, of the steps in which walls and floor stay."""
+    steps = [it for it in results if it.step <= STEPS]
+    answered = [seen for it in steps for seen in it.answered]
+    enough, little = ([seen for it in steps for seen in it.where(enough=enough)] for enough in (True, False))
+    found = [[seen for seen in some if seen.error_m is not None] for some in (enough, little)]
+    lines = [
+        f"- localized where {100 * ENOUGH_LEFT:.0f} % of the surveyed points are left: {_of(found[0], enough)}",
+        f"- localized where less: {_of(found[1], little)}",
+        f"- within 68 %: {_of([it for it in answered if it.is_within(it.position_68_m)], answered)}, within 95 %: "
+        f"{_of([it for it in answered if it.is_within(it.position_95_m)], answered)}",
+    ]
+    last = steps[-1]
+    median, largest = _centimetres([it.error_m for it in last.answered if it.error_m is not None])
+    lines.append(f"- answers at step {last.step}: off by {median} (median), {largest} (largest)")
+    if last.adopted_errors_m:
+        median, largest = _centimetres(last.adopted_errors_m)
+        lines.append(f"- adopted references at step {last.step}: off by {median} (median), {largest} (largest)")
+    return lines
+
+
+def with_section(page: str, seed: int, commit: str, reports: Sequence[str]) -> str:
+    """A page with the section of a seed, in place of an older one or at its end."""
+    head, command = f"## Room of seed {seed}\n", f"`python -m research.renovation FOLDER --seed {seed} --page`"
+    section = "\n\n".join([f"{head}\n{command}, {date.today().isoformat()}, {commit}.", *reports]) + "\n"
+    before, found, after = page.partition(head)
+    if not found:
+        return f"{page.rstrip()}\n\n{section}"
+    _, following, rest = after.partition("\n## ")
+    return before + section + following + rest
 
 
 def _answers(result: StepResult, first: float) -> list[str]:

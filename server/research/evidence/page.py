@@ -85,10 +85,11 @@ def rewritten(text: str, key: str, rows: Sequence[Row], data: str = "", sample: 
     begin, end = found.span() if found is not None else (0, 0)
     after = after[:begin] + table(rows) + ("" if found is not None else "\n") + after[end:]
     where = (f" DATA={data}" if data else "") + (f" ARGS='--sample {sample}'" if sample else "")
-    return f"{before}**Command.** `make evidence KEY={key}{where}`, {date.today().isoformat()}, {_commit()}.\n\n{after}"
+    when = f"{date.today().isoformat()}, {measured_commit()}"
+    return f"{before}**Command.** `make evidence KEY={key}{where}`, {when}.\n\n{after}"
 
 
-def _commit() -> str:
+def measured_commit() -> str:
     """The commit whose code is measured, and whether files differ from it."""
 
     def git(*arguments: str) -> str:
