@@ -6,18 +6,18 @@ from datetime import date, datetime, timedelta, timezone
 import grpc
 import numpy as np
 import pytest
-from support.servers import CAMERA, PHOTO, RunningServer, Staged, Stubs, failure_of, make_scene, serving
+from support.servers import CAMERA, PHOTO, RunningServer, Staged, Stubs, failure_of, make_scene, pose, serving
 from support.waiting import wait_until
 
-from mapless import Client, PositionPrior, Priors
+from mapless import AdoptionPolicy, Client, GroupRejected, PositionPrior, Priors, Rejected, RigImage
 from mapless.scene_reports import SceneReport
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1.localization_service_pb2_grpc import LocalizationServiceStub
 from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
-from mapless_server.method.rejection import Rejection, RejectionReason
+from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.security import SceneKey
 from mapless_server.serve import counting
-from mapless_server.store import counts
+from mapless_server.store import adoption, counts
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums
 
 ELSEWHERE = Rejection(RejectionReason.LOW_OVERLAP, "another place")
@@ -123,3 +123,29 @@ def test_wrong_days_are_refused_by_field(
         request = pb.GetSceneReportRequest(scene=f"scenes/{scene}", **given)  # type: ignore[arg-type]
         error = failure_of(stubs.references.GetSceneReport, request)
     assert (error.code, error.field) == ("INVALID_ARGUMENT", field)
+
+
+def test_rejections_name_the_place_that_needs_a_new_survey(
+    client: Client, server: RunningServer, scene: str, method: Staged
+) -> None:
+    store = server.engine.references.retrievals[0].indexes._store
+    key = store.find_keys(SceneKey(scene), ["r1"])["r1"]
+    adoption.change_standings(store.database, [key], lambda _, it: adoption.outdated(it))
+    rig, said = [RigImage(PHOTO, CAMERA, pose(i)) for i in range(2)], []
+    try:
+        for adopts in (AdoptionPolicy(), None):
+            client.update_scene(scene, adoption=adopts)
+            for advice in (Advice.LOOK_AT_REFERENCE, Advice.RETAKE_PHOTOGRAPH):
+                hint = Hint("match", advice, advice.value)
+                method.outcome = Rejection(RejectionReason.LOW_OVERLAP, "planted", hint)
+                rejected, together = client.localize(PHOTO, CAMERA, scene), client.localize_rig(rig, scene)
+                assert isinstance(rejected, Rejected)
+                assert isinstance(together, GroupRejected)
+                assert together.outdated_place == rejected.outdated_place
+                assert rejected.hint is not None
+                said.append((rejected.outdated_place, rejected.hint.message))
+    finally:
+        method.outcome = None
+    place = f"scenes/{scene}/references/r1"
+    again = "Survey the place of reference r1 again: photographs show too little of what was surveyed."
+    assert said == [(place, again), (place, "retake_photograph"), ("", "look_at_reference"), ("", "retake_photograph")]
