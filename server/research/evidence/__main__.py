@@ -37,6 +37,7 @@ MODULES = {
     "depth_scores": ("depth-scores", "depth-radius"),
     "adopting": ("adoption-matches", "adoption-rivals", "adoption-contradictions"),
     "retrieval_lists": ("retrieval-lists",),
+    "scenes_tried": ("scenes-tried",),
     "network_matches": ("rematched-keypoints", "promising-matches"),
 }
 """The keys of each module, by its MEASUREMENTS; a module is imported when one of them is measured."""
