@@ -7,13 +7,15 @@ can be written down, and reads back as it was; a page begins after a legal id.
 import asyncio
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from datetime import datetime, timezone
+from contextlib import ExitStack
+from datetime import date, datetime, timezone
 from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
 import numpy as np
+from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 
 from mapless import wire
@@ -34,7 +36,17 @@ from mapless_server.scenes.plausibility import contradictions
 from mapless_server.security import Principal, SceneKey, key_of, scene_id_of, tenant_of
 from mapless_server.services import references as reference_service
 from mapless_server.services.messages.references import MAX_PAGE_SIZE
-from mapless_server.store import NewReference, ReferenceRecord, Retirement, SceneAttributes, SceneRecord, codec, rows
+from mapless_server.services.reports import MOST_DAYS, MOST_PERIOD_DAYS, days_from_message
+from mapless_server.store import (
+    NewReference,
+    ReferenceRecord,
+    Retirement,
+    SceneAttributes,
+    SceneRecord,
+    adoption,
+    codec,
+    rows,
+)
 from mapless_server.store.depth_images import decode_depth_image, encode_depth_image
 
 from . import messages
@@ -231,6 +243,32 @@ def _stored(key: SceneKey, new: NewReference) -> ReferenceRecord:
     return record
 
 
+def _retire(store: WatchfulStore, key: SceneKey, reference_id: str) -> ReferenceRecord:
+    return store.get_reference(key, reference_id)
+
+
+def _restore(store: WatchfulStore, key: SceneKey, since: datetime | None, place_id: str) -> list[str]:
+    check_key(key)
+    assert since is None or since.tzinfo is not None
+    return [check_id(place_id)] if place_id else []
+
+
+def _report(store: WatchfulStore, key: SceneKey, request: pb.GetSceneReportRequest) -> pb.SceneReport:
+    check_key(key)
+    first, last, days = days_from_message(request, date(2026, 11, 30))
+    assert 0 <= last - first < MOST_DAYS
+    assert 1 <= days <= MOST_PERIOD_DAYS
+    return pb.SceneReport()
+
+
+_OF_DATABASES: tuple[tuple[Any, str, Any], ...] = (
+    (adoption, "retire_by_operator", _retire),
+    (adoption, "restore", _restore),
+    (reference_service, "scene_report", _report),
+)
+"""Stand-ins for what reads or changes databases beside the store's methods."""
+
+
 @cache
 def _service() -> tuple[reference_service.ReferenceService, asyncio.AbstractEventLoop]:
     engine: Any = WatchfulEngine()
@@ -250,6 +288,13 @@ def check(data: bytes) -> bool:
     service, loop = _service()
     call = Call("id", 0.0, float("inf"), Principal(TENANT))
     method = getattr(service, METHODS[type(request)])
+    with ExitStack() as stack:
+        for room, name, stand_in in _OF_DATABASES:
+            stack.enter_context(patch.object(room, name, stand_in))
+        return _answered(request, method, call, loop)
+
+
+def _answered(request: Message, method: Any, call: Call, loop: asyncio.AbstractEventLoop) -> bool:
     return answered(request, lambda: loop.run_until_complete(method(request, call)).SerializeToString())
 
 
@@ -307,6 +352,7 @@ def seeds() -> tuple[bytes, ...]:
         pb.RetireReferenceRequest(name=reference),
         pb.RestoreReferenceRequest(name=reference),
         pb.RestoreReferencesRequest(scene=scene, place=reference),
+        pb.GetSceneReportRequest(scene=scene, first_day="2026-11-02", last_day="2026-11-29", days_per_period=7),
         retrieve,
         pb.AuditSceneRequest(
             scene=scene, page_size=2, page_token=_token(pb.AuditSceneRequest(scene=scene, page_size=2))

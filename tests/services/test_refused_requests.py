@@ -224,7 +224,12 @@ BAD: dict[str, list[Case]] = {
     "DeleteReference": [("name", "scenes/../references/x")],
     "RetireReference": [("name", "scenes/../references/x")],
     "RestoreReference": [("name", "scenes/../references/x")],
-    "RestoreReferences": [("scene", "s"), ("place", "x"), ("place", "scenes/other/references/x"), ("since.nanos", -1)],
+    "RestoreReferences": [
+        ("scene", "s"),
+        ("place", "x"),
+        ("place", "scenes/other/references/x"),
+        ("since.nanos", -1, "since"),
+    ],
     "GetSceneReport": [("scene", "s"), ("first_day", "today"), ("last_day", "2026-13-01"), ("days_per_period", 367)],
     "CreateScene": [
         ("scene_id", ".."),
