@@ -197,7 +197,7 @@ class TestPage:
         text = " ".join(page.words)
         assert "no photographs counted yet" in text
         assert ("The scene has no references." in text) == (count == 0)
-        assert page.tags["svg"] == (0 if count == 0 else 3)  # the plan, and two signs
+        assert page.tags["svg"] == (0 if count == 0 else 2)  # the plan, and what grey means
 
     def test_lengths_without_metres_are_in_units(self) -> None:
         arbitrary = replace(planted(), arbitrary_unit=True)

@@ -319,7 +319,7 @@ class TestFailures:
             assert shown["/what-fails/suggestion-1-label"].text == "1"
             assert "look &lt;here&gt;" in layer.legend.content
             self.choose(layer, show=False)
-            assert not any(it.visible for it in shown.values())
+            assert not any(it.visible for it in (*shown.values(), layer.legend))
             self.choose(layer, show=True)
             assert asked == [4]
             self.choose(layer, show=True, weeks="1 week")

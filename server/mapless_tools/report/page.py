@@ -70,7 +70,7 @@ def report_page(report: SceneReport, scene: Scene, references: Iterable[Referenc
         summary=_summary(report, counted),
         outdated=[it.reference_id for it in places if it.is_outdated],
         floors=_floors(report, scene, places),
-        signs=_signs(places),
+        signs=_signs(places, bool(report.suggestions)),
         notes=_notes(report, scene, places, omitted_count),
         charts=[outcomes_svg(report.periods), ageing_svg(report.periods)] if counted else [],
         week_head=("first day", "photographs", "localized", "survey left", "68 % within", "matches", "rejected"),
@@ -145,7 +145,7 @@ def _shown(report: SceneReport, places: Sequence[Place], basis: Array) -> tuple[
     return low - short - _MARGIN * extent, high + short + _MARGIN * extent
 
 
-def _signs(places: Sequence[Place]) -> list[Sign]:
+def _signs(places: Sequence[Place], has_suggestions: bool) -> list[Sign]:
     """The legend: colours and shapes that occur."""
     colours = {it.colour for it in places}
     signs = [Sign("place", colour, f"a place: {words}") for _, colour, words in SHARES if colour in colours]
@@ -161,10 +161,15 @@ def _signs(places: Sequence[Place]) -> list[Sign]:
         ("plus", ADOPTED_COLOUR, "adopted references are in use there", any(it.adopted_count for it in places)),
         ("cross", "currentColor", "retired references", any(it.retired_count for it in places)),
         ("square", OUTDATED, "outdated: needs a new survey", any(it.is_outdated for it in places)),
+        (
+            "number",
+            SUGGESTED,
+            "a suggestion: its arrow ends where to take a reference, and points ahead",
+            has_suggestions,
+        ),
     ):
         if occurs:
             signs.append(Sign(shape, colour, words))
-    signs.append(Sign("number", SUGGESTED, "a suggestion: its arrow ends where to take a reference, and points ahead"))
     return signs
 
 

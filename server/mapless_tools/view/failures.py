@@ -22,7 +22,7 @@ _FIRST = "4 weeks"
 NOTHING_COUNTED = "No photographs counted yet."
 MOST_POINTS = 40
 """Points of the rejected photographs of a place; more are not distinguishable."""
-_PLACE, _POINT, _ARROW = 0.5, 0.16, 2.0
+_PLACE, _POINT, _ARROW = 0.5, 0.22, 2.0
 """Sizes of places, of points and of arrows, relative to the references'."""
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
@@ -59,7 +59,7 @@ class Failures:
                     self._was_read = True
                 except MaplessError as error:
                     self.legend.content = f"<p>{escape(str(error))}</p>"
-            for it in self._drawn:
+            for it in (*self._drawn, self.legend):
                 it.visible = visible
 
     def _draw(self, report: SceneReport) -> None:
