@@ -74,7 +74,7 @@ def report_page(report: SceneReport, scene: Scene, references: Iterable[Referenc
         notes=_notes(report, scene, places, omitted_count),
         charts=[outcomes_svg(report.periods), ageing_svg(report.periods)] if counted else [],
         week_head=("first day", "photographs", "localized", "survey left", "68 % within", "matches", "rejected"),
-        weeks=[_week(it, _unit(report)) for it in report.periods],
+        weeks=[_week(it, _unit(report)) for it in report.periods if it.photograph_count],
         place_head=("place of", "photographs", "localized", "rejected", "survey left", "adopted", "retired", "why"),
         rows=_rows(places),
         most_rows=MOST_ROWS,
