@@ -1,8 +1,9 @@
 """Has localized photographs become references of scenes that adopt, after they were answered, while the server is idle.
 
-An answer is offered on the event loop, which takes microseconds; one task then takes one photograph after another, when
-nothing has been computed for callers for a while. What is decided, and why, is in `scenes.adoption.policy`. Photographs
-wait in memory, in a queue that is bounded in number and bytes, and those that wait when the server stops are forgotten.
+An answer is offered on the event loop, which takes less than a millisecond; one task then takes one photograph after
+another, when nothing has been computed for callers for a while. What is decided, and why, is in
+`scenes.adoption.policy`. Photographs wait in memory, in a queue that is bounded in number and bytes, and those that
+wait when the server stops are forgotten.
 """
 
 import asyncio
@@ -71,7 +72,7 @@ class Adopter:
     def offer(self, asked: pb.LocalizeOptions, query: Query, result: Result, principal: Principal) -> pb.AdoptionOffer:
         """Remembers an answered photograph whose call allows adoption, if it may be adopted; says why not.
 
-        Called on the event loop, after the answer is made; it takes microseconds.
+        Called on the event loop, after the answer is made; it takes less than a millisecond.
         """
         policy = result.attributes.adoption
         if asked.confidential:

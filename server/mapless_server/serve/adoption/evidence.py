@@ -7,38 +7,38 @@ import numpy as np
 from mapless.geometry import Array
 from mapless.names import parse_reference_name
 from mapless.scenes import AdoptionPolicy
-from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.group_cameras import read_with
 from mapless_server.engine.query import Query, Result
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.pose.pnp import MIN_MATCHES, PnpOptions, ransac
 from mapless_server.scenes.adoption.policy import Evidence, camera_error_m
-from mapless_server.services.messages.answers import used_camera
+from mapless_server.services.messages.answers import radii_of, used_camera
 from mapless_server.services.messages.debug import sent_pixels
 
 RIVALS = PnpOptions(max_iterations=2000)
 """As the pose itself, but rare rivals need not be found: so many iterations find one that 15 % of matches agree on."""
 
 
-def evidence_of(response: pb.LocalizeResponse, result: Result) -> Evidence | None:
-    """The evidence of a response and the result that it was made of; None for a rejection, or a pose without radii."""
-    answer, localization = result.answer, response.localization
-    if not isinstance(answer.outcome, Localization) or not localization.HasField("accuracy"):
+def evidence_of(query: Query, result: Result) -> Evidence | None:
+    """The evidence of a result, with the radii that are reported; None for a rejection, or a pose without radii."""
+    answer, outcome = result.answer, result.answer.outcome
+    if not isinstance(outcome, Localization) or outcome.covariance is None:
         return None
     ids = [parse_reference_name(it.name)[1] for it in result.references]
     counts = zip(ids, answer.reference_inlier_counts, strict=True)
-    radii = localization.accuracy
+    reported = radii_of(result, query.options, outcome.covariance)
+    radii = reported.accuracy
     return Evidence(
-        answer.outcome.world_from_camera,
+        outcome.world_from_camera,
         radii.position_68_m,
         radii.position_95_m,
         radii.rotation_68_deg,
         radii.rotation_95_deg,
-        answer.outcome.trust or 0.0,
-        answer.outcome.inlier_count,
+        outcome.trust or 0.0,
+        outcome.inlier_count,
         {name: count for name, count in counts if count},
-        np.reshape(localization.covariance.row_major, (6, 6)),
+        reported.covariance,
     )
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapless.axes import Axes
 from mapless.geometry import Array, RigidTransform
 from mapless_server.engine.query import Caller, Query, Result
 from mapless_server.engine.queue_engine import QueueEngine
@@ -19,7 +18,6 @@ from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
 from mapless_server.scenes.retrieval.index import Entries
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey, tenant_of
-from mapless_server.services.messages.answers import AnswerFrames, outcome_to_message
 from mapless_server.store import Store, adoption
 
 from .evidence import distance_shown, evidence_of, shares_compared
@@ -139,8 +137,7 @@ class SurveyedLocalizer:
     @staticmethod
     def evidence(query: Query, result: Result) -> Evidence | None:
         """The evidence of a result; None for a rejection, or a pose without radii."""
-        response = outcome_to_message(result, query.options, AnswerFrames(Axes.OPENCV, None), query.photo)
-        return evidence_of(response, result)
+        return evidence_of(query, result)
 
     async def shares(
         self, query: Query, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions

@@ -56,7 +56,7 @@ def outcome_to_message(
         rejection = result_to_rejection(result, options, frames)
         set_used_intrinsics(rejection, used_camera(result, options, photo))
         return pb.LocalizeResponse(rejection=rejection, scene=scene_to_name(result.scene_key))
-    radii = None if outcome.covariance is None else _radii_of(result, options, outcome.covariance)
+    radii = None if outcome.covariance is None else radii_of(result, options, outcome.covariance)
     localization = _localization_to_message(outcome, radii, result.attributes, frames)
     set_used_intrinsics(localization, used_camera(result, options, photo))
     return pb.LocalizeResponse(localization=localization, scene=scene_to_name(result.scene_key))
@@ -94,14 +94,14 @@ def result_to_rejection(result: Result, options: LocalizeOptions, frames: Answer
     assert isinstance(rejection, Rejection)
     message, pose = rejection_to_message(rejection, result.scene_key), rejection.imprecise
     if pose is not None and pose.covariance is not None and frames.includes_imprecise:
-        offered, radii = _hypothesis_to_message(pose, result.scene_key), _radii_of(result, options, pose.covariance)
+        offered, radii = _hypothesis_to_message(pose, result.scene_key), radii_of(result, options, pose.covariance)
         offered.arbitrary_unit = result.attributes.arbitrary_unit
         _set_radii(offered, pose.world_from_camera, radii, result.attributes, frames)
         message.hypotheses.append(offered)
     return message
 
 
-def _radii_of(result: Result, options: LocalizeOptions, covariance: Array) -> ReportedRadii:
+def radii_of(result: Result, options: LocalizeOptions, covariance: Array) -> ReportedRadii:
     """The reported radii of the pose of a result, by its covariance (6, 6)."""
     accuracy, support = accuracy_from_covariance(covariance), result.answer.support
     conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
