@@ -256,6 +256,21 @@ def test_a_job_that_gives_way_has_threads_of_its_own() -> None:
     assert toy.ending_of(job) is Ending.OK
 
 
+@pytest.mark.parametrize("is_admitted", [False, True])
+def test_a_job_that_gives_way_leaves_a_server_idle(is_admitted: bool) -> None:
+    """One that tries again, too; an idle server admits a call whatever is predicted."""
+    toy = Toy(low=1)
+    for _ in range(2):
+        job = background(toy)
+        fallback = Fallback[object, str](lambda _: Done("first"), FAR_S)
+        step = Step("prepare", "toy", "b", "again")
+        toy.finish(toy.take("host", is_low=True), Next((step,), fallback, is_admitted=is_admitted))
+        assert (toy.ending_of(job), sum(job.booked_s.values())) == (None, 0)
+        toy.finish(toy.take("host", is_low=True), Done(None))
+        assert toy.ending_of(job) is Ending.OK
+    toy.admit(deadline_s=toy.now_s + 0.3)
+
+
 def test_a_job_that_gives_way_takes_no_room() -> None:
     """Neither while it waits nor while it is computed."""
     toy, without = Toy(low=1), Toy(low=1)

@@ -81,7 +81,9 @@ class Ledger:
         self.rebook(job, cost_s)
 
     def rebook(self, job: AnyJob, cost_s: Counter[str]) -> None:
-        """Replaces the computing time predicted for a job, by lane."""
+        """Replaces the computing time predicted for a job, by lane; none is booked for one that is set aside."""
+        if job in self._aside:
+            return
         for holdings in self._holding(job.flow):
             for lane, seconds in job.booked_s.items():  # Counter's methods take ten times as long
                 holdings.booked_s[lane] -= seconds
@@ -90,7 +92,9 @@ class Ledger:
         job.booked_s = cost_s
 
     def set_aside(self, job: AnyJob) -> None:
-        """Counts a job for nothing but its memory, because it waits aside for a further step."""
+        """Counts a job for nothing but its memory, because it waits aside, until `resume`; no change if it was."""
+        if job in self._aside:
+            return
         self.rebook(job, Counter())
         self._aside.add(job)
         for holdings in self._holding(job.flow):
