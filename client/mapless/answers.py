@@ -301,6 +301,7 @@ class Rejected:
         text += [f"  {it}" for it in (*self.diagnostics.ladder_cuts, *_missing(self.diagnostics))]
         if self.diagnostics.captured:
             text.append(f"  {_CAPTURED}")
+        text += [f"  adoption: {ADOPTION_OFFERS.get(it, it)}" for it in (self.diagnostics.adoption,) if it]
         return "\n".join(text)
 
 

@@ -212,7 +212,7 @@ ADOPTION_OFFERS = {
     "SCENE_ADOPTS_NOTHING": "not kept: the scene adopts nothing",
     "CONFIDENTIAL": "not kept: the call is confidential",
     "REFERENCES_NAMED": "not kept: the call names references",
-    "NOT_LOCALIZED": "not kept: it is not localized alone",
+    "NOT_LOCALIZED": "not kept: it is not localized",
     "UNCERTAIN": "not kept: it is less certain than the scene's policy asks for",
     "QUEUE_FULL": "not kept: too many photographs wait to be considered",
 }

@@ -41,7 +41,9 @@ def test_adopted_references_are_shown_and_undone(run: Run, client: Client, scene
     _, text, _ = run("reference", "list", scene, "--adopted")
     assert [line.split()[:3] for line in text.splitlines()[1:]] == [["new", "50", "%"]]
     assert "r0, r1" in text
-    assert "adopted from a localized photograph, within 0.02 (95 %)" in run("reference", "show", scene, "new")[1]
+    shown = run("reference", "show", scene, "new")[1]
+    for said in ("adopted from a localized photograph, within 0.02 m (95 %)", "50 % of its matches", "r0 ", ", r1 "):
+        assert said in shown
     tomorrow = datetime.now(timezone.utc) + timedelta(days=1)
     assert "0 adopted" in run("reference", "undo-adoption", scene, "--since", f"{tomorrow:%Y-%m-%d}", "--yes")[1]
     assert "1 adopted" in run("reference", "undo-adoption", scene, "--since", "2026-01-01", "--yes")[1]
@@ -55,7 +57,8 @@ def test_retired_references_are_shown_and_restored(run: Run, server: RunningServ
     adoption.retire(store, SceneKey(scene), [keys["r1"]], RetirementReason.CONTRADICTED)
     _, text, _ = run("reference", "list", scene, "--retired")
     assert "do not show what it shows" in text
-    assert "retired on" in run("reference", "show", scene, "r1")[1]
+    assert "retired on" not in text + (shown := run("reference", "show", scene, "r1")[1])
+    assert "UTC: photographs from about its viewpoint do not show" in shown
     assert run("reference", "restore", scene, "r1") == (0, "r1 is chosen for photographs\n", "")
     assert list(client.list_references(scene, only_retired=True)) == []
 

@@ -9,6 +9,7 @@ from support.commands import run_client
 from support.servers import RunningServer
 
 from mapless import AdoptionPolicy, Client
+from mapless.cli.report import reasons
 from mapless_server.security import SceneKey
 from mapless_server.store import Store, adoption, counts
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums
@@ -47,9 +48,8 @@ def test_an_operator_sees_weeks_places_and_what_helps(run: Run, aging: tuple[Sto
     lines = text.splitlines()
     assert (code, lines[0]) == (0, f"{scene}, 2026-03-02 to 2026-03-15 (UTC)")
     assert lines[3].split() == ["2026-03-02", "20", "100", "%", "1.8", "cm", "200", "100", "%"]
-    assert lines[4].startswith(
-        "2026-03-09           23       43 %       5.0 cm      100      40 %  LOW_OVERLAP 8, LOW_TEX"
-    )
+    week = "2026-03-09           23       43 %       5.0 cm      100      40 %  LOW_OVERLAP 8, LOW_TEXTURE 3, GATE 2"
+    assert lines[4] == week
     assert [it.split()[:3] for it in lines[8:10]] == [["r1", "10", "40"], ["r0", "3", "3"]]
     advice = " ".join(it.strip() for it in lines[lines.index("What would help most:") + 1 :])
     assert advice.startswith("1. 10 of 40 photographs around r1 were rejected, most often because they do not connect")
@@ -60,13 +60,21 @@ def test_an_operator_sees_weeks_places_and_what_helps(run: Run, aging: tuple[Sto
 def test_a_bad_week_and_an_outdated_place_are_exit_codes(run: Run, aging: tuple[Store, str], client: Client) -> None:
     store, scene = aging
     period = ["--text", "--until", LAST, "--alert-below"]
-    assert [run(scene, *period, share)[0] for share in ("0.4", "0.45")] == [0, 3]
+    assert run(scene, *period, "0.9")[0] == 0  # 23 photographs are too few to judge
+    counts.add_counts(store.database, {SceneKey(scene): {CountKey(TODAY - 6, "", LOCALIZED): Sums(27)}})
+    for by in ([], ["--by-day"]):  # 37 of 50; on the last day 10 of 20
+        assert [run(scene, *by, *period, share)[0] for share in ("0.74", "0.75")] == [0, 3]
+    assert (
+        "\nTo do: 74 % of the last 7 days' 50 photographs were localized, less than 75 %\n"
+        in run(scene, *period, "0.75")[1]
+    )
     client.update_scene(scene, adoption=AdoptionPolicy())
     keys = store.find_keys(SceneKey(scene), ["r1", "r2"])
     adoption.change_standings(store.database, keys.values(), lambda _, it: adoption.outdated(it))
     code, text, _ = run(scene, *period, "0.4")
     assert code == 3
-    assert "Places that need a new survey: r1, r2\n" in text
+    assert "\nTo do: 2 places need a new survey\n" in text
+    assert "Places that need a new survey: r1 at (1.00, 2.00, -1.00), r2 at (2.00, 2.00, -1.00)\n" in text
     assert "the place has changed: survey it again" in " ".join(text.split())
 
 
@@ -76,8 +84,36 @@ def test_what_was_adopted_and_retired_is_summed_by_reason(run: Run, aging: tuple
     happened = {CountKey(TODAY, "", counts.happening(*it)): Sums(count) for it, count in planted.items()}
     counts.add_counts(store.database, {SceneKey(scene): happened})
     _, text, _ = run(scene, "--text", "--until", LAST)
-    shown = "adopted      3\nnot adopted  nothing_new 5\nretired      2 (contradicted 2)\n"
+    shown = "adopted      3\nnot adopted  nothing_new 5\nretired      2 by servers (contradicted 2)\n"
     assert shown in text
+
+
+def test_a_report_says_its_reason_without_photographs(run: Run, server: RunningServer, scene: str) -> None:
+    store: Store = server.engine.references.retrievals[0].indexes._store
+    keys = store.find_keys(SceneKey(scene), ["r1"])
+    adoption.change_standings(store.database, keys.values(), lambda _, it: adoption.outdated(it))
+    code, text, _ = run(scene, "--text", "--alert-below", "0.5")
+    assert code == 3
+    for said in (
+        "To do: a place needs a new survey",
+        "no photographs were counted",
+        "new survey: r1 at (1.00, 2.00, -1.00)",
+    ):
+        assert said in text
+
+
+def test_what_was_retired_by_hand_is_in_the_report(run: Run, client: Client, scene: str) -> None:
+    client.retire_reference(scene, "r1")
+    head, row = run(scene, "--text")[1].splitlines()[-2:]
+    assert head.split() == ["REFERENCE", "RETIRED", "ON"]
+    assert row.startswith("r1")
+    assert row.endswith("by request of a caller who may change the scene")
+
+
+def test_reasons_add_up_to_all_rejections() -> None:
+    assert reasons({"GATE": 2, "AMBIGUOUS": 2, "LOW_OVERLAP": 8, "PNP_FAILED": 1, "LOW_TEXTURE": 1}) == (
+        "LOW_OVERLAP 8, AMBIGUOUS 2, GATE 2, others 2"
+    )
 
 
 def test_programs_get_all_of_it(run: Run, aging: tuple[Store, str]) -> None:
@@ -100,6 +136,8 @@ def test_a_scene_without_photographs_says_so(run: Run, scene: str) -> None:
         (["--weeks", "0"], "must be 1 to 500"),
         (["--weeks", "2", "--since", "2026-03-01"], "not allowed with"),
         (["--alert-below", "90"], "must be 0 to 1"),
+        (["--until", "0001-01-01"], "must be 1970-01-01 or later"),
+        (["--until", "9999-01-01"], "--until 9999-01-01 is after today"),
         (["--since", "2026-03-02", "--until", "2026-03-01"], "--since 2026-03-02 is after --until 2026-03-01"),
     ],
 )

@@ -389,7 +389,9 @@ def test_an_answer_says_why_nothing_is_kept(held: Held, monkeypatch: pytest.Monk
     assert client.localize(query.data, query.camera, "room").diagnostics.adoption == ""
     assert said(confidential=True) == "CONFIDENTIAL"
     assert said(references=[it.name for it in held.place.references[::2]]) == "REFERENCES_NAMED"
-    assert client.localize(_noise(), query.camera, "room", allow_adoption=True).diagnostics.adoption == "NOT_LOCALIZED"
+    rejected = client.localize(_noise(), query.camera, "room", allow_adoption=True)
+    assert rejected.diagnostics.adoption == "NOT_LOCALIZED"
+    assert str(rejected).endswith("\n  adoption: not kept: it is not localized")
     client.update_scene("room", adoption=replace(POLICY, max_radius_m=1e-5))
     assert said() == "UNCERTAIN"
     held.taken()  # what it says of its place counts

@@ -117,7 +117,7 @@ class TestPlan:
         found = places_of(report(far, place("near", upright(7, 8), 1, {"GATE": 1})), [])
         at, colours = layer(drawn(dict(enumerate(found))), "_rejections")
         np.testing.assert_allclose(at, [(5, 6), (5, 6), (7, 8)])
-        assert colours == [REASONS[it][0] for it in ("GATE", "AMBIGUOUS", "GATE")]
+        assert colours == [REASONS[it] for it in ("GATE", "AMBIGUOUS", "GATE")]
 
     def test_places_are_at_their_references_and_point_ahead(self) -> None:
         (found,) = places_of(report(place("a", upright(3, 4, turn=-np.pi / 2), 9, {})), [])
@@ -152,8 +152,7 @@ class TestPlan:
         seen = Seen("", PLAN, np.zeros(2), np.full(2, 9.0), {7: found}, {}, 1, "m")
         titles = re.findall(r'<a xlink:href="#place-7"[^>]*><title>(.*?)</title>', plan_svg(seen))
         assert set(titles) == {
-            "&lt;b&gt;入口&amp;$x$ \N{ARABIC LETTER ALEF}: 9 of 10 photographs localized; rejected: "
-            "1 the evidence for a pose does not suffice"
+            "&lt;b&gt;入口&amp;$x$ \N{ARABIC LETTER ALEF}: 9 of 10 photographs localized; rejected: GATE 1"
         }
 
 
@@ -174,7 +173,7 @@ class TestPage:
         text = " ".join(" ".join(page.words).split())
         assert page.tags["b"] == page.tags["script"] == page.tags["link"] == 0
         for expected in (
-            f"Places that need a new survey: {STRANGE}",
+            f"Places that need a new survey: {STRANGE} at (0.00, 0.00, 1.50)",
             f"4 photographs around {STRANGE} were rejected.",
             "13 photographs, 15 % of them localized",
             "Floor 1 of 2, from above: references at a height of 1.5 to 1.5 m",
@@ -182,7 +181,9 @@ class TestPage:
             "Seen along the scene's direction of gravity",
             "2 rejected photographs are not on the plan",
             "3 further references are not drawn",
-            "new reason (NEW_REASON, 1)",
+            "1 rejected, NEW_REASON",
+            "5 rejected, GATE: the evidence for a pose does not suffice",
+            "GATE 5, LOW_OVERLAP 3, LOW_TEXTURE 2, NEW_REASON 1",
         ):
             assert expected in text
         links = [value for _, name, value in page.attributes if name in ("href", "xlink:href", "src")]
@@ -240,7 +241,9 @@ class TestCommand:
         ("arguments", "error"),
         [
             (("--since", "2026-11-30", "--until", "2026-11-01"), "--since 2026-11-30 is after --until 2026-11-01"),
-            (("--since", "tomorrow"), "--since"),
+            (("--since", "tomorrow"), "'tomorrow' is no day such as 2026-11-02"),
+            (("--until", "2026-11-31"), "'2026-11-31' is no day such as 2026-11-02"),
+            (("--until", "0001-01-01"), "must be 1970-01-01 or later"),
             (("--weeks", "0"), "--weeks"),
             (("--html", "/absent/page.html"), "/absent/page.html cannot be written"),
         ],

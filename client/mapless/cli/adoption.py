@@ -127,13 +127,17 @@ def adopted_table(references: list[Reference]) -> list[str]:
     for it in references:
         vouchers = ", ".join(one.reference_id for one in it.provenance.vouchers[:3])
         share = f"{100 * it.provenance.surveyed_share:.0f} %"
-        rows.append((it.reference_id, share, vouchers, f"{it.create_time:%Y-%m-%d %H:%M}", it.retirement))
-    return table(("REFERENCE", "SURVEYED", "VOUCHERS", "ADOPTED", "RETIRED"), rows)
+        rows.append((it.reference_id, share, vouchers, f"{it.create_time:%Y-%m-%d %H:%M}", _retired(it)))
+    return table(("REFERENCE", "SURVEYED", "VOUCHERS", "ADOPTED", "RETIRED ON"), rows)
+
+
+def _retired(it: Reference) -> str:
+    return it.retirement.removeprefix("retired on ")
 
 
 def retired_table(references: list[Reference]) -> list[str]:
     """A table of retired references, with why."""
-    return table(("REFERENCE", "WHY"), [(it.reference_id, it.retirement) for it in references])
+    return table(("REFERENCE", "RETIRED ON"), [(it.reference_id, _retired(it)) for it in references])
 
 
 def places_table(references: list[Reference]) -> list[str]:

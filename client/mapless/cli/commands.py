@@ -17,7 +17,7 @@ from ..names import check_id
 from ..pixels import format_of_image
 from ..provenance import ADOPTED, GIVEN, PLACED, Provenance
 from ..requests import NewReference
-from ..results import Reference, Scene, summary_of
+from ..results import PlaceState, Reference, Scene, summary_of
 from .adoption import adopted_table, places_table, policy_of, policy_text, retired_table
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import depth_of, limits
@@ -202,7 +202,7 @@ def _position(pose: RigidTransform) -> list[str]:
     return [f"{coordinate:.3f}" for coordinate in pose.translation]
 
 
-def _reference_card(it: Reference) -> list[str]:
+def _reference_card(it: Reference, unit: str = "m") -> list[str]:
     camera, q = it.camera, it.world_from_camera.quaternion()
     lens = None if camera.distortion is None else lens_model_of(camera.distortion)
     return card(
@@ -213,8 +213,11 @@ def _reference_card(it: Reference) -> list[str]:
         lens=None if lens is None else f"{lens} {' '.join(f'{k:g}' for k in vars(camera.distortion).values())}",
         position=" ".join(_position(it.world_from_camera)),
         rotation=f"x {q.x:.4f}  y {q.y:.4f}  z {q.z:.4f}  w {q.w:.4f}",
-        pose=_pose_of(it.provenance),
-        retired=it.retirement or None,
+        pose=_pose_of(it.provenance, unit),
+        surveyed=f"{100 * it.provenance.surveyed_share:.0f} % of its matches" if it.provenance.vouchers else None,
+        vouchers=", ".join(f"{one.reference_id} {one.match_count}" for one in it.provenance.vouchers) or None,
+        place=None if it.place is None else _state_of(it.place),
+        retired=it.retirement.removeprefix("retired on ") or None,
         depth=_depth_of(it),
         features=it.feature_count,
         sha256=it.image_sha256,
@@ -232,11 +235,16 @@ def _depth_of(it: Reference) -> str | None:
     return ", ".join(parts)
 
 
-def _pose_of(provenance: Provenance) -> str:
+def _pose_of(provenance: Provenance, unit: str) -> str:
     accuracy = provenance.accuracy
     known = {PLACED: "placed by mapless", GIVEN: "given", ADOPTED: "adopted from a localized photograph"}
     source = known.get(provenance.source, "unknown")
-    return source if accuracy is None else f"{source}, within {accuracy.position_95_m:.3g} (95 %)"
+    return source if accuracy is None else f"{source}, within {accuracy.position_95_m:.3g} {unit} (95 %)"
+
+
+def _state_of(place: PlaceState) -> str:
+    left = f"{100 * place.surveyed_share:.0f} % of the survey left"
+    return f"{left}, by {place.photograph_count} photographs; {place.contradiction_count} contradictions in a row"
 
 
 def show_reference(client: Client, arguments: argparse.Namespace) -> int:
@@ -245,7 +253,9 @@ def show_reference(client: Client, arguments: argparse.Namespace) -> int:
     if found.depth_sha256:
         whole = client.get_reference(arguments.scene, arguments.reference, include_image=True)
         found = replace(whole, image=None, mask=None)
-    return show(arguments, found, _reference_card(found))
+    has_radius = found.provenance.accuracy is not None
+    unit = "units" if has_radius and client.get_scene(arguments.scene).arbitrary_unit else "m"
+    return show(arguments, found, _reference_card(found, unit))
 
 
 def download_reference(client: Client, arguments: argparse.Namespace) -> int:

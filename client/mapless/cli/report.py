@@ -2,18 +2,23 @@
 
 import argparse
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import date, timedelta
 from textwrap import wrap
 
 from ..client import Client
-from ..scene_reports import PeriodCounts, PlaceReport, SceneReport
+from ..rejections import WORDS, explained
+from ..scene_reports import PeriodCounts, PlaceReport, ReferenceEvent, SceneReport
 from .folder import EXIT_REJECTED
 from .output import card, show, table
 
 DEFAULT_WEEKS, MOST_WEEKS = 4, 500
-WORST_PLACES, SUGGESTIONS, NAMED_PLACES = 5, 3, 10
-"""Places and suggestions that are printed; JSON has all."""
+WORST_PLACES, SUGGESTIONS, NAMED_PLACES, EVENTS = 5, 3, 10, 10
+"""Places, suggestions and retired references that are printed; JSON has all."""
+JUDGED_DAYS, LEAST_PHOTOGRAPHS = 7, 50
+"""A share of localized photographs is judged of the last so many days, if they have so many photographs, as by the
+alert MaplessSceneAges."""
+EPOCH = date(1970, 1, 1)
 WIDTH = 100
 """Characters of a line of a suggestion."""
 
@@ -25,21 +30,22 @@ def add_report(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -
         help="how its photographs were answered, week by week, and what would help",
         description="Photographs by week and reason, the places with most rejections, places that need a new survey, "
         "what was adopted and retired, and where references would help most. Days are UTC. Exit code 0; with "
-        "--alert-below 3 if there is something to do.",
+        "--alert-below 3 if there is something to do, which the text says first.",
     )
     report.add_argument("scene")
     begin = report.add_mutually_exclusive_group()
     begin.add_argument(
         "--weeks", type=_weeks, default=DEFAULT_WEEKS, metavar="N", help=f"so many weeks (default: {DEFAULT_WEEKS})"
     )
-    begin.add_argument("--since", type=_day, metavar="DAY", help="first day, such as 2026-11-02, instead of --weeks")
-    report.add_argument("--until", type=_day, metavar="DAY", help="last day (default: today)")
+    begin.add_argument("--since", type=day_of, metavar="DAY", help="first day, such as 2026-11-02, instead of --weeks")
+    report.add_argument("--until", type=day_of, metavar="DAY", help="last day (default: today)")
     report.add_argument("--by-day", action="store_true", help="count days instead of weeks")
     report.add_argument(
         "--alert-below",
         type=_share,
         metavar="SHARE",
-        help="exit code 3 if a smaller share of the last week is localized, or a place needs a new survey",
+        help=f"exit code 3 if a smaller share of the last {JUDGED_DAYS} days' photographs is localized, where they are "
+        f"{LEAST_PHOTOGRAPHS} or more, or a place needs a new survey",
     )
     report.set_defaults(run=scene_report)
 
@@ -50,11 +56,15 @@ def _weeks(text: str) -> int:
     return int(text)
 
 
-def _day(text: str) -> date:
+def day_of(text: str) -> date:
+    """A day of a flag; ArgumentTypeError names a wrong one."""
     try:
-        return date.fromisoformat(text)
+        day = date.fromisoformat(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no day such as 2026-11-02") from None
+    if day < EPOCH:
+        raise argparse.ArgumentTypeError(f"must be {EPOCH} or later, is {day}")
+    return day
 
 
 def _share(text: str) -> float:
@@ -72,45 +82,97 @@ def scene_report(client: Client, arguments: argparse.Namespace) -> int:
     first_day, last_day = arguments.since, arguments.until
     if first_day is not None and last_day is not None and first_day > last_day:
         raise ValueError(f"--since {first_day} is after --until {last_day}")
-    if first_day is None and (last_day is not None or arguments.weeks != DEFAULT_WEEKS or arguments.by_day):
-        latest = last_day or client.get_scene_report(arguments.scene, days_per_period=1).last_day  # by its clock
-        first_day, last_day = latest - timedelta(days=7 * arguments.weeks - 1), latest
+    if last_day is not None or arguments.weeks != DEFAULT_WEEKS or arguments.by_day:
+        today = client.get_scene_report(arguments.scene, days_per_period=1).last_day
+        if first_day is None:
+            first_day = first_day_of(arguments.weeks, last_day or today)
+        last_day = last_day_of(last_day, today)
     report = client.get_scene_report(
         arguments.scene,
         first_day=first_day,
         last_day=last_day,
         days_per_period=1 if arguments.by_day else 7,
     )
-    show(arguments, report, report_text(report))
-    return EXIT_REJECTED if arguments.alert_below is not None and needs_work(report, arguments.alert_below) else 0
+    to_do = [] if arguments.alert_below is None else work_of(report, arguments.alert_below)
+    show(arguments, report, report_text(report, to_do))
+    return EXIT_REJECTED if to_do else 0
 
 
-def needs_work(report: SceneReport, least_localized_share: float) -> bool:
-    """Whether fewer photographs of the last period are localized, or a place needs a new survey."""
-    share = report.periods[-1].localized_share
-    return any(it.is_outdated for it in report.places) or (share is not None and share < least_localized_share)
+def first_day_of(weeks: int, last_day: date) -> date:
+    """First of so many weeks; at the earliest that of the first day that a report can have."""
+    days = min(7 * weeks - 1, (last_day - EPOCH).days)
+    return last_day - timedelta(days)
 
 
-def report_text(report: SceneReport) -> list[str]:
-    """Lines of the report for a person."""
-    lines = [f"{report.scene_id}, {report.first_day} to {report.last_day} (UTC)", ""]
-    if not any(it.photograph_count for it in report.periods):
-        return [*lines, "no photographs were counted"]
-    lines += _periods(report)
+def last_day_of(wanted: date | None, today: date) -> date:
+    """The last day of a report, today unless another is wanted; ValueError for one after today, the server's day."""
+    if wanted is not None and wanted > today:
+        raise ValueError(f"--until {wanted} is after today, {today} by the server's clock (UTC)")
+    return wanted or today
+
+
+def work_of(report: SceneReport, least_localized_share: float) -> list[str]:
+    """Why something has to be done, a phrase each; empty if nothing has to be.
+
+    A smaller share of the last days' photographs is localized, where they are enough, or places need a new survey.
+    """
+    found = list[str]()
+    days = min(JUDGED_DAYS, (report.last_day - report.first_day).days + 1)
+    last = [it for it in report.periods if it.last_day > report.last_day - timedelta(days)]
+    count, localized = sum(it.photograph_count for it in last), sum(it.localized_count for it in last)
+    if count >= LEAST_PHOTOGRAPHS and localized < least_localized_share * count:
+        share, least = percent(localized / count), percent(least_localized_share)
+        found.append(f"{share} of the last {days} days' {count} photographs were localized, less than {least}")
+    if outdated := sum(it.is_outdated for it in report.places):
+        found.append("a place needs a new survey" if outdated == 1 else f"{outdated} places need a new survey")
+    return found
+
+
+def report_text(report: SceneReport, to_do: Sequence[str] = ()) -> list[str]:
+    """Lines of the report for a person; what is to do comes first."""
+    lines = [f"{report.scene_id}, {report.first_day} to {report.last_day} (UTC)"]
+    if to_do:
+        lines += ["", *wrap(f"To do: {'; '.join(to_do)}", WIDTH, subsequent_indent="       ")]
+    counted = any(it.photograph_count for it in report.periods)
+    lines += ["", *(_periods(report) if counted else ["no photographs were counted"])]
     rejecting = sorted((it for it in report.places if rejected_count(it)), key=rejected_count, reverse=True)
     if rejecting:
         lines += ["", "Where photographs are rejected:", *_worst(rejecting)]
-    outdated = [it.reference_id for it in report.places if it.is_outdated]
-    if outdated:
-        more = f" and {len(outdated) - NAMED_PLACES} more" if len(outdated) > NAMED_PLACES else ""
-        lines += ["", f"Places that need a new survey: {', '.join(outdated[:NAMED_PLACES])}{more}"]
+    if outdated := [named_place(it) for it in report.places if it.is_outdated]:
+        named = _first(outdated, NAMED_PLACES)
+        lines += ["", *wrap(f"Places that need a new survey: {named}", WIDTH, subsequent_indent="   ")]
     if adoption := _adoption(report):
         lines += ["", *adoption]
+    if retired := [it for it in reversed(report.events) if it.kind == "RETIRED"]:
+        lines += ["", "Retired references:", *_retired(retired)]
     if report.suggestions:
         lines += ["", "What would help most:"]
         for i, it in enumerate(report.suggestions[:SUGGESTIONS], 1):
             lines += wrap(f"{i}. {it.message}", WIDTH, subsequent_indent="   ")
+        if (more := len(report.suggestions) - SUGGESTIONS) > 0:
+            lines.append(f"and {more} more")
+    if found := [it for it in rejections_of(report.periods) if it in WORDS]:
+        lines += ["", *map(explained, found)]
     return lines
+
+
+def named_place(place: PlaceReport) -> str:
+    """A place by its reference, and where that is, if it is known."""
+    if place.world_from_camera is None:
+        return place.reference_id
+    x, y, z = place.world_from_camera.translation.tolist()
+    return f"{place.reference_id} at ({x:.2f}, {y:.2f}, {z:.2f})"
+
+
+def _first(names: Sequence[str], most: int) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{', '.join(names[:most])}{more}"
+
+
+def _retired(events: Sequence[ReferenceEvent]) -> list[str]:
+    rows = [(it.reference_id, it.message.removeprefix("retired on ")) for it in events[:EVENTS]]
+    more = len(events) - EVENTS
+    return [*table(("REFERENCE", "RETIRED ON"), rows), *([f"and {more} more before"] if more > 0 else [])]
 
 
 def _periods(report: SceneReport) -> list[str]:
@@ -138,9 +200,10 @@ def percent(share: float | None) -> str:
 
 
 def reasons(rejections: Mapping[str, int], most: int = 3) -> str:
-    """The most frequent reasons of rejections, with their numbers."""
+    """The most frequent reasons of rejections, with their numbers, and the number of all others together."""
     found = sorted(rejections.items(), key=lambda it: (-it[1], it[0]))
-    return ", ".join(f"{reason} {count}" for reason, count in found[:most])
+    others = sum(count for _, count in found[most:])
+    return ", ".join([f"{reason} {count}" for reason, count in found[:most]] + [f"others {others}"] * bool(others))
 
 
 def rejections_of(periods: Iterable[PeriodCounts]) -> Counter[str]:
@@ -178,6 +241,6 @@ def _adoption(report: SceneReport) -> list[str]:
     considered = bool(adopted or adoptions)
     return card(
         adopted=adopted if considered else None,
-        **{"not adopted": reasons(adoptions) or None},
-        retired=f"{retirements.total()} ({reasons(retirements)})" if retirements else None,
+        **{"not adopted": reasons(adoptions, len(adoptions)) or None},
+        retired=f"{retirements.total()} by servers ({reasons(retirements, len(retirements))})" if retirements else None,
     )

@@ -1,12 +1,18 @@
 """The report of the last weeks."""
 
-from datetime import date, timedelta
+from datetime import date
 
 from mapless import Client
+from mapless.cli.report import first_day_of, last_day_of
 from mapless.scene_reports import SceneReport
 
 
-def report_of_weeks(client: Client, scene: str, weeks: int, last_day: date | None = None) -> SceneReport:
-    """The report of so many weeks; they end with the last day or, if it is None, with today by the server's clock."""
-    last = last_day or client.get_scene_report(scene, days_per_period=1).last_day
-    return client.get_scene_report(scene, first_day=last - timedelta(days=7 * weeks - 1), last_day=last)
+def report_of_weeks(
+    client: Client, scene: str, weeks: int, last_day: date | None = None, first_day: date | None = None
+) -> SceneReport:
+    """The report of so many weeks, or from the first day on.
+
+    They end with the last day or, if it is None, with today by the server's clock. ValueError for one after that.
+    """
+    last = last_day_of(last_day, client.get_scene_report(scene, days_per_period=1).last_day)
+    return client.get_scene_report(scene, first_day=first_day or first_day_of(weeks, last), last_day=last)

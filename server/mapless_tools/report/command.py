@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from datetime import datetime
+from argparse import ArgumentTypeError
+from datetime import date
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,16 @@ from mapless_tools.connection import Connection, Scene, with_flags
 
 MOST_DRAWN = 5000
 """References without photographs on a plan."""
-_DAY = ["%Y-%m-%d"]
+
+
+def _day(text: str) -> date:
+    """A day of a flag; the same words as of the client's command."""
+    from mapless.cli.report import day_of
+
+    try:
+        return day_of(text)
+    except ArgumentTypeError as error:
+        raise typer.BadParameter(str(error)) from None
 
 
 @with_flags
@@ -21,8 +31,12 @@ def report_command(
     scene: Scene,
     html: Annotated[Path, typer.Option(help="HTML file to write.")] = Path("report.html"),
     weeks: Annotated[int, typer.Option(min=1, max=500, help="So many weeks.")] = 4,
-    since: Annotated[datetime | None, typer.Option(formats=_DAY, help="First day, UTC, instead of --weeks.")] = None,
-    until: Annotated[datetime | None, typer.Option(formats=_DAY, help="Last day, UTC; default: today.")] = None,
+    since: Annotated[
+        date | None, typer.Option(parser=_day, metavar="DAY", help="First day, UTC, instead of --weeks.")
+    ] = None,
+    until: Annotated[
+        date | None, typer.Option(parser=_day, metavar="DAY", help="Last day, UTC; default: today.")
+    ] = None,
     *,
     connection: Connection,
 ) -> None:
@@ -40,17 +54,13 @@ def report_command(
     from mapless_tools.usage import failures_end_command
 
     if since is not None and until is not None and since > until:
-        fail(f"--since {since:%Y-%m-%d} is after --until {until:%Y-%m-%d}")
+        fail(f"--since {since} is after --until {until}")
     with failures_end_command(ValueError):
         from .asking import report_of_weeks
 
         check_writable(html)
         with terminable(), connected(connection, load_settings({}).settings) as client:
-            last = until.date() if until is not None else None
-            if since is None:
-                report = report_of_weeks(client, scene, weeks, last)
-            else:
-                report = client.get_scene_report(scene, first_day=since.date(), last_day=last)
+            report = report_of_weeks(client, scene, weeks, until, since)
             known = client.get_scene(scene)
             references = list(islice(client.list_references(scene), MOST_DRAWN))
         from .page import report_page

@@ -14,11 +14,12 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 
 from mapless.geometry import Array
+from mapless.rejections import explained
 from mapless.scene_reports import PeriodCounts, ReferenceSuggestion
 from mapless_tools.charts import COLOURS, INK, figure_of, inline_svg, new_axes, plot
 from mapless_tools.plan import axis_label, heading_of
 
-from .places import ADOPTED_COLOUR, OUTDATED, SUGGESTED, Place, reason_colour, reason_words
+from .places import ADOPTED_COLOUR, OUTDATED, SUGGESTED, Place, reason_colour
 
 PIN_IN, RING_IN = 0.055, (0.085, 0.26)
 """Radii on the page, inches: of a reference, and of the rings of one rejected photograph and of the most."""
@@ -74,7 +75,7 @@ def tooltip(place: Place) -> str:
     """What became of a place's photographs, one line."""
     if not place.photograph_count:
         return f"{place.reference_id}: no photographs"
-    why = ", ".join(f"{count} {reason_words(reason)}" for reason, count in place.rejections.items())
+    why = ", ".join(f"{reason} {count}" for reason, count in place.rejections.items())
     text = f"{place.reference_id}: {place.localized_count} of {place.photograph_count} photographs localized"
     return f"{text}; rejected: {why}" if why else text
 
@@ -221,7 +222,7 @@ def outcomes_svg(periods: Sequence[PeriodCounts]) -> str:
             totals[reason] = totals.get(reason, 0) + count
     for reason in sorted(totals, key=lambda it: (-totals[it], it)):
         counts = np.array([it.rejections.get(reason, 0) for it in periods], float)
-        axes.bar(at, counts, 0.8, base, color=reason_colour(reason), label=reason_words(reason))
+        axes.bar(at, counts, 0.8, base, color=reason_colour(reason), label=explained(reason))
         base = base + counts
     axes.set_ylim(0, max(1.0, 1.05 * float(base.max())))
     _name_days(axes, periods)
@@ -233,7 +234,13 @@ def ageing_svg(periods: Sequence[PeriodCounts]) -> str:
     axes = new_axes("How the scene ages", "first day", "%")
     at = range(len(periods))
     plot(axes, "photographs that were localized", at, [_percent(it.localized_share) for it in periods], "o")
-    plot(axes, "matches that the survey still supports", at, [_percent(it.surveyed_share) for it in periods], "s")
+    plot(
+        axes,
+        "surveyed: matches that surveyed references have",
+        at,
+        [_percent(it.surveyed_share) for it in periods],
+        "s",
+    )
     axes.set_ylim(0, 105)
     _name_days(axes, periods)
     return inline_svg(figure_of(axes))

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapless import Reference, Scene
-from mapless.cli.report import percent
+from mapless.cli.report import named_place, percent, reasons
 from mapless.geometry import Array
+from mapless.rejections import explained
 from mapless.scene_reports import PeriodCounts, SceneReport
 from mapless_tools.output_files import render
 from mapless_tools.plan import basis_from_above, vertical_of
@@ -25,7 +26,6 @@ from .places import (
     floors_of,
     places_of,
     reason_colour,
-    reason_words,
 )
 
 MOST_ROWS = 300
@@ -68,17 +68,21 @@ def report_page(report: SceneReport, scene: Scene, references: Iterable[Referenc
         title=f"Scene {report.scene_id}: what became of its photographs",
         report=report,
         summary=_summary(report, counted),
-        outdated=[it.reference_id for it in places if it.is_outdated],
+        outdated=[named_place(it) for it in report.places if it.is_outdated],
+        has_rejected=any(it.rejected_count for it in report.periods),
         floors=_floors(report, scene, places),
         signs=_signs(places, bool(report.suggestions)),
         notes=_notes(report, scene, places, omitted_count),
         charts=[outcomes_svg(report.periods), ageing_svg(report.periods)] if counted else [],
-        week_head=("first day", "photographs", "localized", "survey left", "68 % within", "matches", "rejected"),
+        week_head=("first day", "photographs", "localized", "68 % within", "inliers", "surveyed", "rejected"),
         weeks=[_week(it, _unit(report)) for it in report.periods if it.photograph_count],
         place_head=("place of", "photographs", "localized", "rejected", "survey left", "adopted", "retired", "why"),
         rows=_rows(places),
         most_rows=MOST_ROWS,
-        events=[(f"{it.time:%Y-%m-%d}", it.kind.lower(), it.reference_id, it.message) for it in report.events][::-1],
+        events=[
+            (f"{it.time:%Y-%m-%d}", it.kind.lower(), it.reference_id, it.message.removeprefix("retired on "))
+            for it in report.events
+        ][::-1],
     )
 
 
@@ -151,10 +155,11 @@ def _signs(places: Sequence[Place], has_suggestions: bool) -> list[Sign]:
     signs = [Sign("place", colour, f"a place: {words}") for _, colour, words in SHARES if colour in colours]
     if NONE in colours:
         signs.append(Sign("place", NONE, "a place of which no photograph came"))
-    reasons = {reason: sum(it.rejections.get(reason, 0) for it in places) for it in places for reason in it.rejections}
-    for reason in sorted(reasons, key=lambda it: (-reasons[it], it)):
-        words = f"rejected photographs: {reason_words(reason)} ({reason}, {reasons[reason]})"
-        signs.append(Sign("ring", reason_colour(reason), words))
+    totals = {reason: sum(it.rejections.get(reason, 0) for it in places) for it in places for reason in it.rejections}
+    signs += [
+        Sign("ring", reason_colour(reason), f"{totals[reason]} rejected, {explained(reason)}")
+        for reason in sorted(totals, key=lambda it: (-totals[it], it))
+    ]
     if any(it.has_priors and it.rejections for it in places):
         signs.append(Sign("dotted", "currentColor", "from a place to where its rejected photographs were taken"))
     for shape, colour, words, occurs in (
@@ -209,15 +214,15 @@ def _week(it: PeriodCounts, unit: str) -> tuple[str, ...]:
         f"{it.first_day}",
         f"{it.photograph_count}",
         percent(it.localized_share),
-        percent(it.surveyed_share),
         radius,
         "" if it.inlier_count is None else f"{it.inlier_count:.0f}",
+        percent(it.surveyed_share),
         _why(it.rejections),
     )
 
 
 def _why(rejections: Mapping[str, int]) -> str:
-    return "; ".join(f"{count} {reason_words(reason)}" for reason, count in rejections.items())
+    return reasons(rejections, len(rejections))
 
 
 def _rows(places: Sequence[Place]) -> list[Row]:

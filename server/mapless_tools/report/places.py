@@ -27,29 +27,24 @@ SHARES = (
 SUGGESTED, ADOPTED_COLOUR, OUTDATED = "#222222", "#1f9a55", "#e0561f"
 
 REASONS = {
-    "LOW_OVERLAP": ("#8467d8", "too little in common with the references"),
-    "GATE": ("#d667b4", "the evidence for a pose does not suffice"),
-    "TOO_FEW_MATCHES": ("#18a0a0", "too few matches have a point"),
-    "PNP_FAILED": ("#6f9a1f", "no pose explains the matches"),
-    "AMBIGUOUS": ("#a8713f", "two places look alike"),
-    "PRIOR_CONFLICT": ("#5f7f95", "the pose contradicts the priors"),
-    "LOW_TEXTURE": ("#f08a6c", "the photograph shows too little texture"),
-    "NO_USABLE_REFERENCES": ("#b03ad1", "no reference can be used"),
-    "DEGENERATE_REFERENCES": ("#4cae8f", "the references stand at one position"),
-    "SCALE_UNRELIABLE": ("#b5b021", "the references give no scale"),
+    "LOW_OVERLAP": "#8467d8",
+    "GATE": "#d667b4",
+    "TOO_FEW_MATCHES": "#18a0a0",
+    "PNP_FAILED": "#6f9a1f",
+    "AMBIGUOUS": "#a8713f",
+    "PRIOR_CONFLICT": "#5f7f95",
+    "LOW_TEXTURE": "#f08a6c",
+    "NO_USABLE_REFERENCES": "#b03ad1",
+    "DEGENERATE_REFERENCES": "#4cae8f",
+    "SCALE_UNRELIABLE": "#b5b021",
 }
-"""Colour and words of each reason of rejections; readable on white and on black."""
+"""Colour of each reason of rejections; readable on white and on black."""
 _UNKNOWN_COLOUR = "#777777"
 
 
 def reason_colour(reason: str) -> str:
     """The colour of a reason; grey for one of a newer server."""
-    return REASONS[reason][0] if reason in REASONS else _UNKNOWN_COLOUR
-
-
-def reason_words(reason: str) -> str:
-    """Words for a reason."""
-    return REASONS[reason][1] if reason in REASONS else reason.lower().replace("_", " ")
+    return REASONS.get(reason, _UNKNOWN_COLOUR)
 
 
 @dataclass(frozen=True, eq=False)

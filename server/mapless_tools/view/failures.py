@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from mapless import MaplessError
 from mapless.geometry import Array
+from mapless.rejections import explained
 from mapless.scene_reports import SceneReport
-from mapless_tools.report.places import SHARES, Place, places_of, reason_colour, reason_words
+from mapless_tools.report.places import SHARES, Place, places_of, reason_colour
 
 from .drawing import Drawing, rgb
 from .guarded import GuardedViser
@@ -119,7 +120,7 @@ def legend(report: SceneReport) -> str:
         for reason, count in period.rejections.items():
             totals[reason] = totals.get(reason, 0) + count
     for reason in sorted(totals, key=lambda it: (-totals[it], it)):
-        lines.append(_coloured("&#8226;", reason_colour(reason), f"{totals[reason]} rejected: {reason_words(reason)}"))
+        lines.append(_coloured("&#8226;", reason_colour(reason), f"{totals[reason]} rejected, {explained(reason)}"))
     lines += [f"{number}. {escape(it.message)}" for number, it in enumerate(report.suggestions, 1)]
     return f'<div style="font-size: 0.85em; padding: 0 0.6em">{"<br>".join(lines)}</div>'
 
