@@ -40,6 +40,7 @@ from .messages.queries import (
     with_depth,
 )
 from .messages.references import (
+    MOST_NAMED,
     Page,
     Record,
     attributes_from_message,
@@ -49,6 +50,7 @@ from .messages.references import (
     implausible_depths,
     kept_adopted,
     labels_from_message,
+    named_place,
     nearly_ignored,
     new_provenance,
     outdated_places,
@@ -122,8 +124,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         warnings = dict.fromkeys(agreement.warnings(scene.attributes.arbitrary_unit))
         if not agreement.contradicts_itself:  # else what its references say of lenses is of no use
             warnings |= await self._stored(self._lens_warnings, key)
-        if scene.attributes.adoption is not None:
-            warnings |= await self._stored(self._outdated_places, key)
+        warnings |= await self._stored(self._outdated_places, key)
         return pb.GetSceneResponse(
             scene=scene_to_message(scene),
             warnings=warnings,
@@ -151,11 +152,14 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         return dict.fromkeys(it.lens for it in known.self_calibrations if it.lens and it.generation == newest)
 
     def _outdated_places(self, key: SceneKey) -> dict[str, None]:
-        """Says which places of a scene that adopts need a new survey."""
+        """Says which places of a scene need a new survey."""
         from mapless_server.store import adoption
+        from mapless_server.store.counts import find_references
 
-        outdated = list(adoption.list_outdated(self._store.database, key).values())
-        return dict.fromkeys([outdated_places(outdated)] if outdated else [])
+        outdated = adoption.list_outdated(self._store.database, key)
+        named = find_references(self._store.database, key, list(outdated)[:MOST_NAMED])
+        places = [named_place(name, named.get(it)) for it, name in outdated.items()]
+        return dict.fromkeys([outdated_places(places)] if places else [])
 
     async def UpdateScene(self, request: pb.UpdateSceneRequest, call: Call) -> pb.UpdateSceneResponse:
         """Implements ReferenceService.UpdateScene."""

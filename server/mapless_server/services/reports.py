@@ -38,7 +38,7 @@ def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRe
     first, last, days = days_from_message(request, datetime.now(timezone.utc).date())
     scene, scene_id = store.get_scene(scene_key), scene_id_of(scene_key)
     stored = read_report(store.database, scene_key, first, last, MOST_EVENTS)
-    outdated = list_outdated(store.database, scene_key) if scene.attributes.adoption else {}
+    outdated = list_outdated(store.database, scene_key)
     keys = {*(it.place_key for it in stored.counts), *(it.place_key for it in stored.events), *outdated}
     records = find_references(store.database, scene_key, keys)
     counted = by_place(stored.counts, records)

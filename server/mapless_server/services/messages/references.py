@@ -127,10 +127,18 @@ MOST_NAMED = 10
 """Places that one warning names."""
 
 
-def outdated_places(reference_ids: Sequence[str]) -> str:
-    """One sentence for a person that says which places, named by their surveyed references, need a new survey."""
-    more = len(reference_ids) - MOST_NAMED
-    named = ", ".join(reference_ids[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+def named_place(reference_id: str, record: ReferenceRecord | None) -> str:
+    """A place by its surveyed reference, and where that is; without the record by its id alone."""
+    if record is None:
+        return reference_id
+    x, y, z = record.world_from_camera.translation.tolist()
+    return f"{reference_id} at ({x:.2f}, {y:.2f}, {z:.2f})"
+
+
+def outdated_places(places: Sequence[str]) -> str:
+    """One sentence for a person that says which places, each a `named_place`, need a new survey."""
+    more = len(places) - MOST_NAMED
+    named = ", ".join(places[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
     return (
         f"photographs around {named} show too little of what was surveyed, so that what was adopted there is retired: "
         "survey these places again"
