@@ -60,7 +60,7 @@ class AdoptionOptions:
     min_matches: int = 30
     min_vouchers: int = 2
     voucher_matches: int = 8
-    min_rivals: int = 30
+    min_rivals: int = 20
     min_novelty: float = 0.2
     explained_share: float = 0.04
     first_usefulness: float = 0.2
