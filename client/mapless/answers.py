@@ -260,7 +260,7 @@ class Rejected:
         scene: name of the scene in whose world the poses are; of several, the one whose references matched best. Empty
             if none of several has a reference, and from servers before 0.4.
         outdated_place: name of the reference whose place needs a new survey, if the photograph was compared with
-            references of such a place of a scene that adopts; else empty, and from servers before 0.4.
+            references of such a place; else empty, and from servers before 0.4.
         is_final: always True.
     """
 

@@ -52,7 +52,9 @@ def test_an_operator_sees_weeks_places_and_what_helps(run: Run, aging: tuple[Sto
     assert lines[4] == week
     assert [it.split()[:3] for it in lines[8:10]] == [["r1", "10", "40"], ["r0", "3", "3"]]
     advice = " ".join(it.strip() for it in lines[lines.index("What would help most:") + 1 :])
-    assert advice.startswith("1. 10 of 40 photographs around r1 were rejected, most often because they do not connect")
+    assert advice.startswith(
+        "1. 10 of 40 photographs around r1 were rejected, most often LOW_OVERLAP (too little in common"
+    )
     assert "2 m from r1, looking along (0.0, 0.0, 1.0): add references there" in advice
     assert "r0 were rejected" not in advice  # dark photographs
 
@@ -75,7 +77,7 @@ def test_a_bad_week_and_an_outdated_place_are_exit_codes(run: Run, aging: tuple[
     assert code == 3
     assert "\nTo do: 2 places need a new survey\n" in text
     assert "Places that need a new survey: r1 at (1.00, 2.00, -1.00), r2 at (2.00, 2.00, -1.00)\n" in text
-    assert "the place has changed: survey it again" in " ".join(text.split())
+    assert "the place has changed: survey it again, around (3.00, 2.00, -1.00)" in " ".join(text.split())
 
 
 def test_what_was_adopted_and_retired_is_summed_by_reason(run: Run, aging: tuple[Store, str]) -> None:

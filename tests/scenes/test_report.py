@@ -9,10 +9,12 @@ import pytest
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.scenes.report.counting import Places, Sighting, counted
+from mapless_server.scenes.report.renewal import added_days, since_added
 from mapless_server.scenes.report.summary import Cluster, by_place, periods_of, suggestions, total
 from mapless_server.scenes.retrieval.index import SceneIndex
 from mapless_server.store.counts import DAY_US, LOCALIZED, CountKey, Sums
 from mapless_server.store.records import Adopted, IndexedReference, SceneChanges
+from mapless_server.store.surveys import Surveyed
 
 DAY = 20_000
 LOW, GATE, DARK = (it.value for it in (RejectionReason.LOW_OVERLAP, RejectionReason.GATE, RejectionReason.LOW_TEXTURE))
@@ -142,3 +144,14 @@ def test_counts_of_deleted_references_have_no_place() -> None:
     assert list(found) == ["", "p"]
     assert total(found[""].values()).photograph_count == 5
     assert math.isclose(sum(it.photograph_count for it in planted.values()), 6)
+
+
+def test_rejections_before_a_reference_was_added_do_not_count() -> None:
+    """Two of one day renew no other; what is added later is at the older one that is nearest and looks as it does."""
+    stored = {"a": (0, at(0.0)), "b": (0, at(10.0)), "c": (7, at(6.0)), "d": (8, at(9.0, 180.0)), "e": (9, at(6.5))}
+    surveyed = [Surveyed(key, (DAY + day) * DAY_US, pose) for key, (day, pose) in stored.items()]
+    assert added_days(surveyed, DAY) == {"b": DAY + 8, "c": DAY + 9}
+    assert added_days(surveyed[:2], DAY) == added_days([], DAY) == {}
+    planted = {"b": {CountKey(DAY + day, "b", LOW): Sums(photograph_count=day) for day in (3, 8, 9)}}
+    (left,) = since_added(planted, added_days(surveyed, DAY))["b"]
+    assert left.day == DAY + 9

@@ -159,7 +159,7 @@ def test_places_that_need_a_new_survey_are_named(client: Client, server: Running
         lambda _, it: adoption.outdated(replace(it, surveyed_share=0.2, photograph_count=5)),
     )
     (warning,) = client.get_scene(adopting).warnings
-    assert warning.startswith("photographs around r2 show too little of what was surveyed")
+    assert warning.startswith("photographs around r2 at (2.00, 2.00, -1.00) show too little of what was surveyed")
     places = {it.reference_id: it.place for it in client.list_references(adopting)}
     assert places == {"r0": None, "r1": None, "r2": PlaceState(0.2, 5, 0)}
     assert adoption.read_standings(store_of(server).database, [key])[key].photograph_count == 5

@@ -69,6 +69,7 @@ def test_photographs_are_counted_by_place_and_reason(client: Client, scene: str,
     assert [suggested.photograph_count, suggested.distance_m] == pytest.approx([3.0, 40.0], rel=0.01)
     assert "3 of 3 photographs around r2 were rejected" in suggested.message
     assert "40 m from r2, looking along (" in suggested.message
+    assert ") as r2, since no prior says it: add references there" in suggested.message
 
 
 def test_a_confidential_photograph_is_not_counted(client: Client, scene: str) -> None:
@@ -147,5 +148,8 @@ def test_rejections_name_the_place_that_needs_a_new_survey(
     finally:
         method.outcome = None
     place = f"scenes/{scene}/references/r1"
-    again = "Survey the place of reference r1 again: photographs show too little of what was surveyed."
-    assert said == [(place, again), (place, "retake_photograph"), ("", "look_at_reference"), ("", "retake_photograph")]
+    again = (
+        "Survey the place of reference r1 at (1.00, 2.00, -1.00) again: photographs show too little of what was "
+        "surveyed."
+    )
+    assert said == 2 * [(place, again), (place, "retake_photograph")]  # also after the scene has stopped adopting

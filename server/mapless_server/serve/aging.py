@@ -47,6 +47,6 @@ def _age(store: Store, scene: BusyScene) -> SceneAge | None:
         scene.localized_count / scene.photograph_count,
         scene.localized_before / scene.photographs_before if scene.photographs_before else None,
         counts.least_surveyed_share(store.database, scene.scene_key, least) if adopts else None,
-        len(adoption.list_outdated(store.database, scene.scene_key)) if adopts else 0,
+        len(adoption.list_outdated(store.database, scene.scene_key)),
         *counts.count_references(store.database, scene.scene_key),
     )

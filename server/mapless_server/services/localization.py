@@ -201,8 +201,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         return response
 
     async def _name_outdated(self, response: Any, results: Sequence[Result]) -> None:
-        """Says in rejections, of scenes that adopt, which place needs a new survey."""
-        if response.WhichOneof("outcome") != "rejection" or all(it.attributes.adoption is None for it in results):
+        """Says in rejections which place needs a new survey."""
+        if response.WhichOneof("outcome") != "rejection":
             return
         await asyncio.to_thread(name_outdated_place, self._store, response.rejection, results)
 

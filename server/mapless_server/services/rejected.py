@@ -16,6 +16,8 @@ from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.security import scene_id_of
 from mapless_server.store import Store
 
+from .messages.references import named_place
+
 LACKS_REFERENCES = {
     pb.ADVICE_UNSPECIFIED,
     pb.ADVICE_ADD_REFERENCES,
@@ -65,9 +67,10 @@ def name_outdated_place(store: Store, rejection: pb.Rejection, results: Iterable
     Reads the store.
     """
     from mapless_server.store import adoption  # for these rejections alone
+    from mapless_server.store.counts import find_references
 
     for result in results:
-        if result.scene_key is None or result.attributes.adoption is None or not result.references:
+        if result.scene_key is None or not result.references:
             continue
         outdated = adoption.list_outdated(store.database, result.scene_key)
         counts = result.answer.reference_match_counts or (0,) * len(result.references)
@@ -79,8 +82,10 @@ def name_outdated_place(store: Store, rejection: pb.Rejection, results: Iterable
         reference_id = outdated[place]
         rejection.outdated_place = names.reference_name(scene_id_of(result.scene_key), reference_id)
         if rejection.hint.advice in LACKS_REFERENCES:
+            records = find_references(store.database, result.scene_key, [place])
             rejection.hint.advice = pb.ADVICE_ADD_REFERENCES
             rejection.hint.message = (
-                f"Survey the place of reference {reference_id} again: photographs show too little of what was surveyed."
+                f"Survey the place of reference {named_place(reference_id, records.get(place))} again: "
+                "photographs show too little of what was surveyed."
             )
         return

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from mapless import names
 from mapless.geometry import Array
+from mapless.rejections import WORDS
 from mapless.v1 import geometry_pb2
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
@@ -31,9 +32,11 @@ EPOCH = date(1970, 1, 1)
 
 def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRequest) -> pb.SceneReport:
     """The report that a request asks for; FieldError names a wrong day, NotFound if there is no such scene."""
+    from mapless_server.scenes.report.renewal import added_days, since_added
     from mapless_server.scenes.report.summary import Cluster, by_place, periods_of, suggestions
     from mapless_server.store.adoption import list_outdated
-    from mapless_server.store.counts import find_references, read_report
+    from mapless_server.store.counts import DAY_US, find_references, read_report
+    from mapless_server.store.surveys import list_surveyed
 
     first, last, days = days_from_message(request, datetime.now(timezone.utc).date())
     scene, scene_id = store.get_scene(scene_key), scene_id_of(scene_key)
@@ -63,7 +66,8 @@ def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRe
         )
         message.places.append(its)
     poses = {key: record.world_from_camera for key, record in records.items()}
-    for it in suggestions(places, poses, last):
+    added = added_days(list_surveyed(store.database, scene_key, first * DAY_US), first)
+    for it in suggestions(since_added(places, added), poses, last):
         at, unit = records[it.place_key], scene.attributes.unit
         message.suggestions.append(suggestion_to_message(it, at, unit, it.place_key in outdated))
     ids = {key: record.reference_id for key, record in records.items()}
@@ -81,7 +85,9 @@ def days_from_message(request: pb.GetSceneReportRequest, today: date) -> tuple[i
     if first > last:
         raise FieldError("first_day", f"must not be after last_day, {_text(last)}, is {_text(first)}")
     if last - first >= MOST_DAYS:
-        raise FieldError("first_day", f"must be less than {MOST_DAYS} days before last_day, is {last - first}")
+        raise FieldError(
+            "first_day", f"must be less than {MOST_DAYS} days before last_day, is {last - first} days before"
+        )
     return first, last, period
 
 
@@ -174,29 +180,20 @@ def suggestion_to_message(
     )
 
 
-_LACKING = {
-    "no_usable_references": "no reference can be used",
-    "degenerate_references": "the references stand at one position",
-    "low_overlap": "they do not connect to the references",
-    "scale_unreliable": "the references give no scale",
-    "too_few_matches": "too few matches have a point",
-    "pnp_failed": "no pose explains the matches",
-    "gate": "the evidence for a pose does not suffice",
-}
-"""Sentences about reasons that further references remedy."""
-
-
 def _sentence(it: Suggestion, reference_id: str, unit: str, is_outdated: bool) -> str:
     x, y, z = it.position.tolist()
     many = f"{it.rejected_count} of {it.photograph_count} photographs around {reference_id} were rejected"
-    why = f"most often because {_LACKING[it.reason.value]}"
+    why = f"most often {it.reason.name} ({WORDS[it.reason.name]})"
     if is_outdated:
-        return f"{many}, {why}; the place has changed: survey it again"
+        return f"{many}, {why}; the place has changed: survey it again, around ({x:.2f}, {y:.2f}, {z:.2f})"
     if it.positioned_share < 0.5:
         return f"{many}, {why}; no prior says where they were taken: add references of what is seen from there"
     along = ", ".join(f"{each:.1f}" for each in it.forward.tolist())
     where = f"on average at ({x:.2f}, {y:.2f}, {z:.2f}), {it.distance_m:.2g} {unit} from {reference_id}"
-    return f"{many}, {why}, {where}, looking along ({along}): add references there"
+    looking = f"looking along ({along})" + (
+        "" if it.forward_is_known else f" as {reference_id}, since no prior says it"
+    )
+    return f"{many}, {why}, {where}, {looking}: add references there"
 
 
 def event_to_message(event: Event, scene_id: str, places: Mapping[str, str]) -> pb.ReferenceEvent:

@@ -147,6 +147,7 @@ class Suggestion:
         position, forward: (3,) each, world; forward of unit length.
         distance_m: distance of the position from the place's reference; 0 if no position is known.
         positioned_share: share of the rejected photographs whose position is known.
+        forward_is_known: whether priors say forward; else it is that of the place's reference.
     """
 
     place_key: str
@@ -158,6 +159,7 @@ class Suggestion:
     forward: Array
     distance_m: float
     positioned_share: float
+    forward_is_known: bool
 
 
 def suggestions(
@@ -186,7 +188,8 @@ def _suggestion(
     for key, sums in lacking.items():
         of_reason[key.outcome] += sums.photograph_count
     cluster = Cluster.of(rejected, pose)
-    forward = pose.rotation[:, 2] if cluster is None or cluster.forward is None else cluster.forward
+    known = None if cluster is None else cluster.forward
+    forward = pose.rotation[:, 2] if known is None else known
     position = pose.translation if cluster is None else cluster.position
     return Suggestion(
         place_key,
@@ -198,6 +201,7 @@ def _suggestion(
         forward,
         float(np.linalg.norm(position - pose.translation)),
         rejected.position_count / rejected.photograph_count,
+        known is not None,
     )
 
 
