@@ -153,8 +153,20 @@ def test_one_holder_or_one_day_retires_no_reference() -> None:
     assert not rules.is_contradicted(contradicted(2, *"abcdefgh"), OPTIONS)
     assert not rules.is_contradicted(contradicted(2, "one", "two"), OPTIONS)
     assert rules.is_contradicted(contradicted(3, "one", "two"), OPTIONS)
+    assert rules.is_contradicted(contradicted(3, *"abcdefgh"), OPTIONS)
     assert not rules.is_contradicted(contradicted(4, ""), OPTIONS)
     assert rules.is_contradicted(contradicted(5, ""), OPTIONS)
+
+
+@pytest.mark.parametrize("honest", [1, 2])
+def test_one_mistake_helps_an_attacker_to_retire_nothing(honest: int) -> None:
+    """Two photographs of others are needed, however many an attacker sends, for references and for places."""
+    known = contradicted(4, "attacker")
+    place = shown(Standing(), 0.1, 8, "attacker")
+    for day in range(4, 4 + honest):
+        known = rules.with_photograph(known, 0.0, 10**15 + day * rules.DAY_US, "one", OPTIONS)
+        place = rules.with_share(place, 0.1, 10**15 + (4 + day) * rules.DAY_US, "one", OPTIONS)
+    assert rules.is_contradicted(known, OPTIONS) is rules.needs_survey(place, POLICY, OPTIONS) is (honest == 2)
 
 
 def test_a_holder_is_a_token_of_a_tenant() -> None:

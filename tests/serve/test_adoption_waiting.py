@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from collections import Counter
 from datetime import datetime, timezone
 from types import SimpleNamespace
 from typing import cast
@@ -22,9 +23,11 @@ from mapless_server.serve.adoption.waiting import MAX_WAITING, MAX_WAITING_BYTES
 from mapless_server.store import Store, adoption
 
 
-def candidate(tenant: str = "one", size_bytes: int = 1, offered_s: float = 0.0, mask: bytes = b"") -> Candidate:
+def candidate(
+    tenant: str = "one", size_bytes: int = 1, offered_s: float = 0.0, mask: bytes = b"", holder: str = ""
+) -> Candidate:
     query = SimpleNamespace(scene_key=key_of(tenant, "room"), photo=SimpleNamespace(size_bytes=size_bytes, mask=mask))
-    return Candidate(cast(Query, query), cast(Evidence, None), np.empty((0, 2)), 1.0, "", offered_s)
+    return Candidate(cast(Query, query), cast(Evidence, None), np.empty((0, 2)), 1.0, holder, offered_s)
 
 
 def tenants(waiting: Waiting) -> list[str]:
@@ -39,6 +42,30 @@ def test_one_tenant_cannot_fill_the_queue() -> None:
     assert sum(waiting.add(candidate()) for _ in range(1000)) == 1000 - MAX_WAITING
     assert [waiting.add(candidate("two")) for _ in range(100)].count(1) == 100
     assert tenants(waiting) == ["one"] * (MAX_WAITING // 2) + ["two"] * (MAX_WAITING // 2)
+
+
+def test_one_holder_leaves_room_for_others_of_its_tenant() -> None:
+    """However many photographs come first; another tenant's share stays what it is."""
+    waiting = Waiting()
+    for _ in range(MAX_WAITING):
+        waiting.add(candidate(holder="flood"))
+    assert [waiting.add(candidate(holder="robot")) for _ in range(3)] == [1, 1, 1]
+    for _ in range(MAX_WAITING):
+        waiting.add(candidate("two", holder="flood"))
+    assert waiting.add(candidate(holder="robot")) == 1
+    left = [waiting.pop() for _ in range(MAX_WAITING)]
+    assert [(it.tenant, it.holder) for it in left if it][-1] == ("one", "robot")
+    counts = Counter((it.tenant, it.holder) for it in left if it)
+    assert counts == {("one", "flood"): 12, ("one", "robot"): 4, ("two", "flood"): 16}
+
+
+def test_what_has_no_room_pushes_out_nothing() -> None:
+    waiting = Waiting()
+    for _ in range(3):
+        waiting.add(candidate(size_bytes=MAX_WAITING_BYTES // 3))
+    assert waiting.add(candidate("two", MAX_WAITING_BYTES + 1)) == 1
+    assert waiting.add(candidate("two", MAX_WAITING_BYTES)) == 1
+    assert tenants(waiting) == ["one"] * 3
 
 
 def test_large_photographs_make_room_for_another_tenant() -> None:

@@ -79,6 +79,24 @@ def test_a_full_place_keeps_the_most_useful(place: Place) -> None:
             adoption.adopt(store, HALL, adopted("y", 0.9), 2)
 
 
+def test_a_flood_by_one_token_pushes_out_one_a_day_at_most(place: Place) -> None:
+    """Each of four gives 15 % of the matches of its place, and a new one may be worth 20 %."""
+    with place.open() as store:
+        hall(store)
+        for i in range(4):
+            adoption.adopt(store, HALL, adopted(f"useful-{i}", 0.15), 4)
+        for day in range(2):
+            adoption.adopt(store, HALL, adopted(f"flood-{day}", adopted_by=f"{day}:robot"), 4)
+            for i in range(3):
+                with pytest.raises(adoption.PlaceFull):
+                    adoption.adopt(store, HALL, adopted(f"more-{day}-{i}", 0.9, adopted_by=f"{day}:robot"), 4)
+        adoption.adopt(store, HALL, adopted("other", adopted_by="1:other"), 4)
+        (key,) = (it.key for it in adoption.list_adopted(store.database, HALL) if it.reference_id == "other")
+        adoption.retire(store, HALL, [key], RetirementReason.BY_OPERATOR)
+        with pytest.raises(adoption.PlaceFull):
+            adoption.adopt(store, HALL, adopted("again", adopted_by="1:other"), 4)
+
+
 def test_over_days_what_photographs_use_stays(place: Place) -> None:
     """Each day three photographs match one of the place's two references, and a new photograph asks for room."""
     options = AdoptionOptions()

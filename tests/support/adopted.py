@@ -16,9 +16,12 @@ RADII = Accuracy(0.01, 0.02, 0.1, 0.2)
 COVARIANCE = (np.diag([1e-4] * 3 + [1e-6] * 3) + 1e-6 * np.eye(6)[::-1]).tolist()
 
 
-def adopted(name: str, usefulness: float = 0.2, vouchers: tuple[Voucher, ...] = VOUCHERS) -> NewReference:
+def adopted(
+    name: str, usefulness: float = 0.2, vouchers: tuple[Voucher, ...] = VOUCHERS, adopted_by: str = ""
+) -> NewReference:
     provenance = Provenance("ADOPTED", RADII, 0.5, vouchers, COVARIANCE)
-    return replace(make_reference(name), provenance=provenance, place_key="place", usefulness=usefulness)
+    its = make_reference(name)
+    return replace(its, provenance=provenance, place_key="place", usefulness=usefulness, adopted_by=adopted_by)
 
 
 def hall(store: Store) -> dict[str, str]:

@@ -32,7 +32,7 @@ class NotAdopted(Exception):
 
 
 class PlaceFull(Exception):
-    """A photograph is not adopted, because its place has as many adopted references as it may, all as useful."""
+    """A photograph is not adopted, because its place has as many as it may, all as useful, or one of its adopter."""
 
 
 def adopt(
@@ -40,7 +40,8 @@ def adopt(
 ) -> tuple[ReferenceRecord, frozenset[str]]:
     """Adds an adopted reference, if the scene still adopts and what vouches for it is still there, in one transaction.
 
-    So many that are not retired are kept at its place, `NewReference.place_key`; the least useful are deleted.
+    So many that are not retired are kept at its place, `NewReference.place_key`; the least useful are deleted. Where
+    there is one of the same `NewReference.adopted_by`, retired or not, there is no place for another.
 
     Returns:
         The new reference, and the keys of those that were deleted.
@@ -63,10 +64,12 @@ def adopt(
         here = (
             select(column.key, adopted.usefulness)
             .join(adopted_reference, adopted.reference_key == column.key)
-            .where(column.scene_id == scene_key, adopted.place_key == new.place_key, ~queries.is_retired(column.key))
+            .where(column.scene_id == scene_key, adopted.place_key == new.place_key)
             .order_by(adopted.usefulness, adopted.adopt_time_us, column.key)
         )
-        found = connection.execute(here).all()
+        if new.adopted_by and connection.execute(here.where(adopted.adopted_by == new.adopted_by)).first() is not None:
+            raise PlaceFull
+        found = connection.execute(here.where(~queries.is_retired(column.key))).all()
         leaving = found[: max(0, len(found) + 1 - most_per_place)]
         if any(it.usefulness >= new.usefulness for it in leaving):
             raise PlaceFull

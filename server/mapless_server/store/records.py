@@ -178,6 +178,7 @@ class NewReference:
         depth: the depth that was measured with it; None without one.
         place_key: of an adopted one, the key of the surveyed reference that is nearest; empty if unknown.
         usefulness: of an adopted one, see `Adopted`.
+        adopted_by: of an adopted one, by whom and on which day; at each place once. Empty where it does not matter.
     """
 
     reference_id: str
@@ -191,6 +192,7 @@ class NewReference:
     depth: DepthImage | None = None
     place_key: str = ""
     usefulness: float = 0.0
+    adopted_by: str = ""
 
 
 class RetirementReason(str, Enum):

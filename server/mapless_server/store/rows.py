@@ -189,6 +189,7 @@ def adopted_row(record: ReferenceRecord, new: NewReference) -> dict[str, Any]:
         "place_key": new.place_key,
         "usefulness": new.usefulness,
         "adopt_time_us": time_us(record.create_time),
+        "adopted_by": new.adopted_by,
     }
 
 

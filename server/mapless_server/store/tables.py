@@ -129,6 +129,7 @@ adopted_reference = Table(
     # Share of what photographs of its place matched that it gave; the least useful go first.
     Column("usefulness", Double, nullable=False),
     Column("adopt_time_us", BigInteger, nullable=False),
+    Column("adopted_by", Text, nullable=False, server_default=text("''")),  # "DAY:HOLDER", who adopts at a place once
     Index("adopted_reference_by_place", "place_key"),
     Index("adopted_reference_by_adopt_time", "adopt_time_us"),
 )

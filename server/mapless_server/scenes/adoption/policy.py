@@ -8,6 +8,7 @@ else a thing that was moved, as a poster, would take a photograph of another pla
 
 import hashlib
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -50,9 +51,10 @@ class AdoptionOptions:
             so near, a share of the distance to what it shows, should show what that shows.
         contradicting_share: such a photograph contradicts the reference where it has a smaller share of its matches
             with it, and agrees where it has twice that.
-        contradictions, contradicting_days, contradicting_holders: contradictions in a row after which a reference is
-            retired, least days on which they came, and least holders of tokens from whom. Each holder counts once a
-            day. A holder who may change the scene could delete the reference, and needs no other.
+        contradictions, contradicting_days, contradicting_others: contradictions in a row after which a reference is
+            retired, least days on which they came, and least that came from others than the holder of a token with
+            most of them. Each holder counts once a day. A holder who may change the scene could delete the reference,
+            and needs no other.
 
     Evidence: adoption-matches, adoption-rivals, adoption-contradictions.
     """
@@ -73,11 +75,11 @@ class AdoptionOptions:
     contradicting_share: float = 0.05
     contradictions: int = 5
     contradicting_days: int = 3
-    contradicting_holders: int = 2
+    contradicting_others: int = 2
 
     def __post_init__(self) -> None:
         counts = "min_matches min_vouchers voucher_matches min_rivals remembered least_photographs photographs_a_day"
-        check_bounds(self, f"{counts} places contradictions contradicting_days contradicting_holders", at_least=1)
+        check_bounds(self, f"{counts} places contradictions contradicting_days contradicting_others", at_least=1)
         check_bounds(self, "min_novelty first_usefulness contradicting_share", at_least=0, at_most=1)
         check_bounds(self, "explained_share same_viewpoint_share", above=0, at_most=1)
         check_bounds(self, "same_viewpoint_deg", above=0, at_most=180)
@@ -99,7 +101,7 @@ class Refusal(str, Enum):
     NOTHING_NEW = "nothing_new"
     """It shows nothing that the references lack."""
     PLACE_FULL = "place_full"
-    """Its place has as many adopted references as it may, all more useful."""
+    """Its place has as many adopted references as it may, all more useful, or one of its caller since today."""
     CHANGED = "changed"
     """The scene has changed meanwhile: it adopts no more, what vouches for it is gone, or another server was first."""
 
@@ -260,10 +262,14 @@ def needs_survey(standing: Standing, policy: AdoptionPolicy, options: AdoptionOp
 
 
 def _are_enough(witnesses: Collection[str], options: AdoptionOptions) -> bool:
-    """Whether witnesses, "DAY:HOLDER", are of enough days, and of enough holders or one who may change the scene."""
+    """Whether witnesses, "DAY:HOLDER", are of enough days, and enough without the holder with most of them.
+
+    Or one is of a holder who may change the scene.
+    """
     days = {it.partition(":")[0] for it in witnesses}
-    holders = {it.partition(":")[2] for it in witnesses}
-    return len(days) >= options.contradicting_days and ("" in holders or len(holders) >= options.contradicting_holders)
+    of_holder = Counter(it.partition(":")[2] for it in witnesses)
+    are_others = len(witnesses) - max(of_holder.values(), default=0) >= options.contradicting_others
+    return len(days) >= options.contradicting_days and ("" in of_holder or are_others)
 
 
 def holder_of(principal: Principal) -> str:
@@ -271,6 +277,11 @@ def holder_of(principal: Principal) -> str:
     if principal.role >= Role.WRITE:
         return ""
     return hashlib.sha256("/".join(principal.holder).encode()).hexdigest()[:16]
+
+
+def adopter_of(holder: str, now_us: int) -> str:
+    """Who adopts a photograph, and on which day (UTC): at each place once; empty for who may change the scene."""
+    return holder and f"{now_us // DAY_US}:{holder}"
 
 
 def with_photograph(standing: Standing, share: float, now_us: int, holder: str, options: AdoptionOptions) -> Standing:

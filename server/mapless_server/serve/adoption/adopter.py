@@ -26,7 +26,7 @@ from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal, SceneKey
-from mapless_server.store import NewReference, Store, adoption
+from mapless_server.store import NewReference, Store, adoption, time_us
 
 from .evidence import distance_shown, inliers_px, kept_query, keypoints_px, rival_count
 from .keeping import Keeper
@@ -219,6 +219,7 @@ class Adopter:
             Provenance(ADOPTED, Accuracy(*radii), share, vouching, surveyed.covariance.tolist()),
             place_key=place.key,
             usefulness=options.first_usefulness,
+            adopted_by=rules.adopter_of(candidate.holder, time_us(self._now())),
         )
         try:
             record, left = await asyncio.to_thread(adoption.adopt, self._store, scene_key, new, policy.most_per_place)

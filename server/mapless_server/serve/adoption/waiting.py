@@ -1,8 +1,9 @@
-"""Photographs that wait to be considered as references: bounded, with room for every tenant."""
+"""Photographs that wait to be considered as references: bounded, with room for every tenant and holder."""
 
 import asyncio
 import time
 from collections import Counter, deque
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -62,26 +63,18 @@ class Waiting:
     def __len__(self) -> int:
         return len(self._candidates)
 
-    @property
-    def size_bytes(self) -> int:
-        """Size of all files."""
-        return sum(it.size_bytes for it in self._candidates)
-
     def add(self, candidate: Candidate) -> int:
         """Adds a candidate; returns how many found no room: it, or others.
 
-        Where the queue is full, the newest of the tenant that has most leave it, as long as it has more than the
-        candidate's tenant would have.
+        Where the queue is full, others leave it as `_leaving` says. None does for a candidate that has no room then.
         """
-        left = 0
-        while len(self._candidates) >= MAX_WAITING or self.size_bytes + candidate.size_bytes > MAX_WAITING_BYTES:
-            counts = Counter(it.tenant for it in self._candidates)
-            most = max(counts, key=lambda it: counts[it], default=candidate.tenant)
-            if counts[most] <= counts[candidate.tenant] + 1:
-                return left + 1
-            self._candidates.remove(next(it for it in reversed(self._candidates) if it.tenant == most))
-            left += 1
-        self._candidates.append(candidate)
+        stay = list(self._candidates)
+        while len(stay) >= MAX_WAITING or sum(map(_size_of, stay)) + candidate.size_bytes > MAX_WAITING_BYTES:
+            if (leaving := _leaving(stay, candidate)) is None:
+                return 1
+            stay.remove(leaving)
+        left = len(self._candidates) - len(stay)
+        self._candidates = deque([*stay, candidate])
         self._arrived.set()
         return left
 
@@ -102,3 +95,24 @@ class Waiting:
             self._arrived.clear()
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._arrived.wait(), limit_s)
+
+
+def _size_of(candidate: Candidate) -> int:
+    return candidate.size_bytes
+
+
+def _leaving(waiting: Sequence[Candidate], candidate: Candidate) -> Candidate | None:
+    """The one that makes room for a candidate: the newest of the holder with most, of the tenant with most.
+
+    Where no tenant has more than the candidate's would have, it is one of that; None if no holder of it has more than
+    the candidate's would have, either.
+    """
+    of_tenant = Counter(it.tenant for it in waiting)
+    tenant = max(of_tenant, key=lambda it: of_tenant[it], default=candidate.tenant)
+    is_own = of_tenant[tenant] <= of_tenant[candidate.tenant] + 1
+    its = [it for it in waiting if it.tenant == (candidate.tenant if is_own else tenant)]
+    of_holder = Counter(it.holder for it in its)
+    holder = max(of_holder, key=lambda it: of_holder[it], default=candidate.holder)
+    if is_own and of_holder[holder] <= of_holder[candidate.holder] + 1:
+        return None
+    return next(it for it in reversed(its) if it.holder == holder)
