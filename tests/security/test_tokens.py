@@ -286,7 +286,8 @@ class TestAccess:
     def test_changing_long_computing_or_watching_takes_write(self) -> None:
         for method, role in METHOD_ROLES.items():
             name = method.rpartition("/")[2]
-            takes_much = re.match(r"Create|BatchCreate|Delete|Restore|Update|AuditScene|WatchQueries", name) is not None
+            much = r"Create|BatchCreate|Delete|Retire|Restore|Update|AuditScene|WatchQueries"
+            takes_much = re.match(much, name) is not None
             assert (role is Role.WRITE) == takes_much, method
 
     @pytest.mark.parametrize(("method", "role"), list(product(METHOD_ROLES, ("read", "localize", "write"))))

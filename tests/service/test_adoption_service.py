@@ -5,6 +5,7 @@ from datetime import datetime, timedelta, timezone
 
 import pytest
 from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose
+from support.waiting import wait_until
 
 from mapless import Accuracy, AdoptionPolicy, Client, NewReference, NotFound, Provenance, Voucher
 from mapless.results import PlaceState
@@ -194,7 +195,7 @@ def test_an_uncertain_answer_is_counted_and_not_kept(client: Client, server: Run
     client.update_scene(scene, adoption=AdoptionPolicy(max_radius_m=1e-6))
     before = server.value("mapless_adoptions_total", result="uncertain")
     client.localize(PHOTO, CAMERA, scene, allow_adoption=True)
-    assert server.value("mapless_adoptions_total", result="uncertain") == before + 1
+    wait_until(lambda: server.value("mapless_adoptions_total", result="uncertain") == before + 1)
     assert list(client.list_references(scene, only_adopted=True)) == []
 
 

@@ -23,6 +23,7 @@ from mapless_server.store import RetirementReason, Store, deletion, postgresql, 
 from mapless_server.store.adoption import retire
 from mapless_server.store.backup import back_up, restore
 from mapless_server.store.calibrations import claim_scene
+from mapless_server.store.counts import LOCALIZED, CountKey, Sums, add_counts
 from mapless_server.store.deletion import PendingDeletions
 from mapless_server.store.depths import keep_depths
 from mapless_server.store.pairs import PairStore, Progress
@@ -102,6 +103,7 @@ def test_all_that_refers_to_a_scene_goes_with_it(place: Place) -> None:
         camera = make_reference("a").camera
         keep_depths(store.database, "kind", {keys[0]: KeptDepth(camera, np.ones((480, 640), np.float32), 0.02)})
         assert claim_scene(store.database, "kind") is not None
+        add_counts(store.database, {OFFICE: {CountKey(0, keys[0], LOCALIZED): Sums(1)}})
         assert filled() == tables
         store.delete_reference(OFFICE, "r0")
         assert filled() == tables - {"reference_pair", "reference_depth"}
