@@ -154,7 +154,8 @@ def metrics_table() -> str:
     rows = []
     for metric in registry.collect():
         name = f"{metric.name}_total" if metric.type == "counter" else metric.name
-        of = labels.get(metric.name) or sorted({label for it in metric.samples for label in it.labels} - {"le"})
+        of = labels.get(metric.name) or list(getattr(metric, "_labelnames", ()))  # of those without samples
+        of = of or sorted({label for it in metric.samples for label in it.labels} - {"le"})
         rows.append([f"`{name}`", metric.type, " ".join(f"`{label}`" for label in of), metric.documentation])
     return table(["metric", "type", "labels", "what it measures"], rows)
 

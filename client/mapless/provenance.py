@@ -1,7 +1,8 @@
 """How the pose of a reference is known, as a value, a message and JSON."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,8 @@ class Provenance:
         covariance: of the same errors as `accuracy`, which it requires: six rows of six, order x y z rx ry rz, metres
             (or the scene's unit) and radians about fixed axes of the scene's world, as of an answer; kept as
             tuples. Adjustments use it, where it is not None, in place of the radii.
+        adopt_time: of an adopted one, when it was adopted, with time zone; None for the time of storing it. It is not
+            compared: the same reference may be stored with it and without.
     """
 
     source: str = GIVEN
@@ -57,8 +60,11 @@ class Provenance:
     surveyed_share: float = 0.0
     vouchers: tuple[Voucher, ...] = ()
     covariance: Sequence[Sequence[float]] | None = None
+    adopt_time: datetime | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
+        if self.adopt_time is not None and (self.source != ADOPTED or self.adopt_time.tzinfo is None):
+            raise ValueError("adopt_time must have a time zone, and is only of an adopted pose")
         if self.covariance is not None:
             object.__setattr__(self, "covariance", _checked(self.covariance))
             if self.accuracy is None:
@@ -122,6 +128,8 @@ def provenance_to_message(provenance: Provenance) -> pb.Provenance:
         wire.set_numbers(message.accuracy, {it: getattr(provenance.accuracy, it) for it in RADII}, "accuracy")
     if provenance.covariance is not None:
         message.covariance.row_major.extend(np.ravel(provenance.covariance).tolist())
+    if provenance.adopt_time is not None:
+        wire.set_time(message.adopt_time, provenance.adopt_time, "adopt_time")
     return message
 
 
@@ -138,7 +146,8 @@ def provenance_from_message(message: pb.Provenance, field: str) -> Provenance:
     covariance = _rows(message.covariance.row_major) if message.HasField("covariance") else None
     try:
         source = wire.value_name(_SOURCE.DESCRIPTOR, message.source)
-        return Provenance(source, accuracy, message.surveyed_share, vouchers, covariance)
+        adopted = message.adopt_time.ToDatetime(timezone.utc) if message.HasField("adopt_time") else None
+        return Provenance(source, accuracy, message.surveyed_share, vouchers, covariance, adopted)
     except ValueError as error:
         name, _, fault = str(error).partition(" ")
         raise FieldError(joined(field, name), fault) from None
@@ -159,6 +168,7 @@ def provenance_to_json(provenance: Provenance) -> dict[str, Any] | None:
     if provenance.source == ADOPTED:
         content["surveyed_share"] = provenance.surveyed_share
         content["vouchers"] = {it.reference_id: it.match_count for it in provenance.vouchers}
+        content |= {} if provenance.adopt_time is None else {"adopt_time": provenance.adopt_time.isoformat()}
     return content
 
 
@@ -182,7 +192,17 @@ def provenance_from_json(content: object) -> Provenance:
     if not isinstance(vouchers, Mapping) or not all(isinstance(it, int) for it in vouchers.values()):
         raise ValueError("vouchers must be an object with numbers of matches")
     vouching = tuple(Voucher(str(name), count) for name, count in vouchers.items())
-    return Provenance(source, accuracy, _number(content, "surveyed_share"), vouching, covariance)
+    share, adopted = _number(content, "surveyed_share"), _time(content.get("adopt_time"))
+    return Provenance(source, accuracy, share, vouching, covariance, adopted)
+
+
+def _time(content: object) -> datetime | None:
+    if content is None:
+        return None
+    try:
+        return datetime.fromisoformat(str(content))
+    except ValueError:
+        raise ValueError(f"adopt_time must be a time such as 2026-11-29T18:00:00+00:00, is {content!r}") from None
 
 
 def _rows(row_major: Sequence[float]) -> tuple[tuple[float, ...], ...]:

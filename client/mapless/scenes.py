@@ -96,7 +96,8 @@ class Calibration:
 
 
 MOST_PER_PLACE, LEAST_SURVEYED_SHARE = 100, 0.1
-"""Bounds of an adoption policy."""
+LEAST_RADIUS_M, LARGEST_RADIUS_M = 1e-6, 10.0
+"""Bounds of an adoption policy; of its radius where the unit of length is the metre."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +107,9 @@ class AdoptionPolicy:
     Attributes:
         most_per_place: most adopted references at a place, which is what is nearer to one surveyed reference than to
             any other, 1 to 100; the least useful go first.
-        min_trust: least trust of an answer, 0 to 1.
-        max_radius_m: largest 68 % radius of an answer's position, metres or the scene's arbitrary unit, above 0.
+        min_trust: least trust of an answer, above 0, at most 1.
+        max_radius_m: largest 68 % radius of an answer's position: 1e-6 to 10 metres, or above 0 in the scene's
+            arbitrary unit, for which the default is nothing to go by.
         min_surveyed_share: least share of a photograph's matches that surveyed references support, 0.1 to 1. Where
             photographs of a place have less, its adopted references are retired until there is a new survey.
     """
@@ -120,8 +122,8 @@ class AdoptionPolicy:
     def __post_init__(self) -> None:
         if not 1 <= self.most_per_place <= MOST_PER_PLACE:
             raise ValueError(f"most_per_place must be 1 to {MOST_PER_PLACE}, is {self.most_per_place}")
-        if not 0 <= self.min_trust <= 1:
-            raise ValueError(f"min_trust must be 0 to 1, is {self.min_trust:g}")
+        if not 0 < self.min_trust <= 1:  # in a message, 0 is the default
+            raise ValueError(f"min_trust must be above 0, at most 1, is {self.min_trust:g}")
         if not 0 < self.max_radius_m < math.inf:
             raise ValueError(f"max_radius_m must be above 0 and finite, is {self.max_radius_m:g}")
         if not LEAST_SURVEYED_SHARE <= self.min_surveyed_share <= 1:

@@ -22,6 +22,8 @@ _ALIKE = 0.7
 """Least length of the mean of the cameras' y axes for which it is used as the direction of gravity."""
 _WEDGE_SHARE = 0.05
 """Length of a camera's wedge, relative to the extent of the plan."""
+_ALONG = 1e-3
+"""A direction is that of a world axis if its other parts are smaller: positions differ by 1 mm in 1 m at most."""
 _LEVEL = 0.25
 """A camera whose optical axis has a shorter horizontal part looks up or down."""
 
@@ -120,10 +122,11 @@ def heading_of(basis: Array, forward: ArrayLike) -> Array | None:
 
 
 def axis_label(direction: Array, unit: str) -> str:
-    """The name of the world axis along a direction, and the unit; the unit alone if none is along it."""
+    """The name of the world axis along a direction, and the unit; where none is, numbers are of the plan alone."""
     largest = int(np.argmax(np.abs(direction)))
     sign = "-" if direction[largest] < 0 else ""
-    return f"{sign}{'xyz'[largest]}, {unit}" if abs(direction[largest]) > 0.999 else unit
+    is_along = float(np.linalg.norm(np.delete(direction, largest))) < _ALONG
+    return f"{sign}{'xyz'[largest]}, {unit}" if is_along else f"along the plan, {unit}"
 
 
 def ellipse_in_plane(basis: Array, covariance: Array) -> tuple[Array, float]:

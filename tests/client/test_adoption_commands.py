@@ -3,13 +3,23 @@
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
+from pathlib import Path
 
 import pytest
 from support.commands import run_client
-from support.servers import CAMERA, PHOTO, RunningServer, pose
+from support.servers import CAMERA, PHOTO, RunningServer, pose, serving
 
-from mapless import Accuracy, AdoptionPolicy, Client, NewReference, Provenance, Voucher
-from mapless_server.security import SceneKey
+from mapless import (
+    Accuracy,
+    AdoptionPolicy,
+    Client,
+    ConnectOptions,
+    NewReference,
+    PermissionDenied,
+    Provenance,
+    Voucher,
+)
+from mapless_server.security import SceneKey, create_token
 from mapless_server.store import RetirementReason, adoption
 
 ADOPTED = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("r0", 40), Voucher("r1", 20)))
@@ -31,7 +41,9 @@ def test_adoption_is_turned_on_changed_and_off(run: Run, client: Client, scene: 
     assert run("scene", "update", scene, "--adopt", "--adopt-trust", "0.7")[0] == 0
     assert client.get_scene(scene).adoption == AdoptionPolicy(most_per_place=2, max_radius_m=0.1, min_trust=0.7)
     code, _, error = run("scene", "update", scene, "--adopt", "--adopt-trust", "2")
-    assert (code, "min_trust must be 0 to 1, is 2" in error) == (2, True)
+    assert (code, "min_trust must be above 0, at most 1, is 2" in error) == (2, True)
+    code, _, error = run("scene", "update", scene, "--adopt", "--adopt-trust", "0")
+    assert (code, "min_trust must be above 0, at most 1, is 0" in error) == (2, True)
     assert run("scene", "update", scene, "--forget", "adoption")[0] == 0
     assert client.get_scene(scene).adoption is None
 
@@ -59,7 +71,8 @@ def test_retired_references_are_shown_and_restored(run: Run, server: RunningServ
     assert "do not show what it shows" in text
     assert "retired on" not in text + (shown := run("reference", "show", scene, "r1")[1])
     assert "UTC: photographs from about its viewpoint do not show" in shown
-    assert run("reference", "restore", scene, "r1") == (0, "r1 is chosen for photographs\n", "")
+    assert run("reference", "restore", scene, "r1") == (0, "r1 is chosen for photographs again\n", "")
+    assert run("reference", "restore", scene, "r1") == (0, "r1 was not retired\n", "")
     assert list(client.list_references(scene, only_retired=True)) == []
 
 
@@ -71,9 +84,43 @@ def test_a_reference_is_retired_and_restored_by_command(run: Run, client: Client
     assert (code, text.splitlines()) == (0, ["1 reference chosen for photographs again", "  r1"])
     assert "1 reference" in run("reference", "restore", scene, "--all")[1]
     assert list(client.list_references(scene, only_retired=True)) == []
-    for flags in ((), ("r1", "--all")):
-        code, _, error = run("reference", "restore", scene, *flags)
-        assert (code, "give one reference, or --all" in error) == (2, True)
+
+
+def test_a_place_is_that_of_a_surveyed_reference(run: Run, client: Client, scene: str) -> None:
+    client.add_reference(scene, NewReference("adopted-1", PHOTO, CAMERA, pose(5.0), provenance=ADOPTED))
+    run("reference", "retire", scene, "adopted-1")
+    assert "adopted-1" not in run("reference", "list", scene, "--places")[1]
+    code, _, error = run("reference", "restore", scene, "--place", "adopted-1")
+    assert (code, "was adopted: name the surveyed reference of its place" in error) == (1, True)
+
+
+def test_undoing_nothing_requires_the_role_all_the_same(tmp_path: Path) -> None:
+    tokens = tmp_path / "tokens"
+    token = {role: create_token(tokens, role, "default", role, None) for role in ("write", "localize")}
+    with serving(tmp_path / "data", tokens_file=tokens) as server:
+        with Client(server.address, ConnectOptions(token=token["write"])) as client:
+            client.create_scene("hall")
+            assert client.undo_adoption("hall", datetime(2026, 1, 1, tzinfo=timezone.utc)) == []
+        with Client(server.address, ConnectOptions(token=token["localize"])) as client:
+            with pytest.raises(PermissionDenied) as caught:
+                client.undo_adoption("hall", datetime(2026, 1, 1, tzinfo=timezone.utc))
+            assert caught.value.reason == "ROLE_TOO_LOW"
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ("", "which ones? Give a REFERENCE, or --place"),
+        ("r1 --all", "REFERENCE does not go together with --all"),
+        ("--place r1 --all", "--all does not go together with --place"),
+        ("--since 2026-01-01 --all", "--all does not go together with --since"),
+        ("r1 --place r1 --since 2026-01-01", "REFERENCE does not go together with --place and --since"),
+        ("--since 20260101", "'20260101' is no time such as"),
+    ],
+)
+def test_flags_that_contradict_each_other_are_named(run: Run, scene: str, flags: str, said: str) -> None:
+    code, _, error = run("reference", "restore", scene, *flags.split())
+    assert (code, said in error) == (2, True)
 
 
 def test_an_arbitrary_unit_has_no_default_radius(run: Run, client: Client, scene: str) -> None:
@@ -84,6 +131,10 @@ def test_an_arbitrary_unit_has_no_default_radius(run: Run, client: Client, scene
     assert (code, "within 0.2 units (68 %)" in text) == (0, True)
     assert "deleted 24 h after it was adopted" in error
     assert "within 0.2 units (68 %)" in run("scene", "get", scene)[1]
+    code, _, error = run("scene", "update", scene, "--adopt", "--unit", "metre")
+    assert (code, "the scene's unit is the metre: give" in error) == (2, True)
+    code, _, error = run("scene", "create", "units", "--unit", "arbitrary", "--adopt")
+    assert (code, "the scene's unit is arbitrary" in error) == (2, True)
 
 
 def test_places_with_the_least_survey_left_come_first(run: Run, server: RunningServer, scene: str) -> None:
@@ -93,6 +144,7 @@ def test_places_with_the_least_survey_left_come_first(run: Run, server: RunningS
     adoption.change_standings(
         store.database, keys.values(), lambda key, it: replace(it, surveyed_share=shares[key], photograph_count=7)
     )
+    run("reference", "retire", scene, "r1")  # photographs said nothing of it
     _, text, _ = run("reference", "list", scene, "--places")
     assert [line.split() for line in text.splitlines()[1:]] == [
         ["r2", "20", "%", "7", "0"],

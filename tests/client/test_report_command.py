@@ -136,7 +136,8 @@ def test_a_scene_without_photographs_says_so(run: Run, scene: str) -> None:
     [
         (["--since", "monday"], "no day such as 2026-11-02"),
         (["--weeks", "0"], "must be 1 to 500"),
-        (["--weeks", "2", "--since", "2026-03-01"], "not allowed with"),
+        (["--weeks", "4", "--since", "2026-03-01"], "not allowed with"),
+        (["--since", "20260301"], "no day such as 2026-11-02"),
         (["--alert-below", "90"], "must be 0 to 1"),
         (["--until", "0001-01-01"], "must be 1970-01-01 or later"),
         (["--until", "9999-01-01"], "--until 9999-01-01 is after today"),

@@ -7,7 +7,7 @@ import pytest
 from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose
 from support.waiting import wait_until
 
-from mapless import Accuracy, AdoptionPolicy, Client, NewReference, NotFound, Provenance, Voucher
+from mapless import Accuracy, AdoptionPolicy, Client, InvalidArgument, NewReference, NotFound, Provenance, Voucher
 from mapless.results import PlaceState
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
@@ -20,7 +20,7 @@ ADOPTED = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("r
 @pytest.fixture
 def adopting(client: Client, scene: str) -> str:
     """A scene of three references that adopts whatever is localized."""
-    client.update_scene(scene, adoption=AdoptionPolicy(min_trust=0.0, max_radius_m=10.0))
+    client.update_scene(scene, adoption=AdoptionPolicy(min_trust=1e-6, max_radius_m=10.0))
     return scene
 
 
@@ -49,6 +49,7 @@ def test_a_policy_is_kept_and_forgotten(client: Client) -> None:
         ("most_per_place", 101),
         ("most_per_place", -1),
         ("min_trust", 1.5),
+        ("min_trust", -0.1),
         ("min_trust", float("nan")),
         ("max_radius_m", -1.0),
         ("max_radius_m", float("inf")),
@@ -62,6 +63,39 @@ def test_a_wrong_policy_is_refused_by_field(stubs: Stubs, field: str, value: flo
     assert (error.code, error.field) == ("INVALID_ARGUMENT", f"adoption.{field}")
     with pytest.raises(ValueError, match=f"^{field} must be"):
         AdoptionPolicy(**{field: value})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("radius", [1e-300, 11.0, 1e300])
+def test_a_radius_in_metres_is_bounded(stubs: Stubs, scene: str, radius: float) -> None:
+    policy = pb.AdoptionPolicy(max_radius_m=radius)
+    create = pb.CreateSceneRequest(scene_id="wrong", adoption=policy)
+    update = pb.UpdateSceneRequest(scene=pb.Scene(name=f"scenes/{scene}", adoption=policy))
+    update.update_mask.paths.append("adoption")
+    refused = failure_of(stubs.references.CreateScene, create), failure_of(stubs.references.UpdateScene, update)
+    assert [it.field for it in refused] == ["adoption.max_radius_m", "scene.adoption.max_radius_m"]
+    assert {it.code for it in refused} == {"INVALID_ARGUMENT"}
+
+
+def test_an_arbitrary_unit_requires_the_radius(stubs: Stubs) -> None:
+    create = pb.CreateSceneRequest(scene_id="units", arbitrary_unit=True, adoption=pb.AdoptionPolicy())
+    refused = failure_of(stubs.references.CreateScene, create)
+    assert (refused.code, refused.field) == ("INVALID_ARGUMENT", "adoption.max_radius_m")
+    create.adoption.max_radius_m = 1e4
+    assert stubs.references.CreateScene(create).scene.adoption.max_radius_m == 1e4
+    update = pb.UpdateSceneRequest(scene=pb.Scene(name="scenes/units", adoption=pb.AdoptionPolicy()))
+    update.update_mask.paths.append("adoption")
+    assert failure_of(stubs.references.UpdateScene, update).field == "scene.adoption.max_radius_m"
+    stubs.references.DeleteScene(pb.DeleteSceneRequest(name="scenes/units"))
+
+
+def test_the_unit_does_not_change_under_a_radius(client: Client, scene: str) -> None:
+    client.update_scene(scene, adoption=AdoptionPolicy())
+    with pytest.raises(InvalidArgument, match="its radius in units") as caught:
+        client.update_scene(scene, arbitrary_unit=True)
+    assert caught.value.field == "scene.adoption.max_radius_m"
+    changed = client.update_scene(scene, arbitrary_unit=True, adoption=AdoptionPolicy(max_radius_m=2.0))
+    assert (changed.arbitrary_unit, changed.adoption) == (True, AdoptionPolicy(max_radius_m=2.0))
+    client.update_scene(scene, arbitrary_unit=False, adoption=None)
 
 
 def test_adopted_references_are_listed_and_undone_by_date(client: Client, scene: str) -> None:
@@ -116,6 +150,9 @@ def test_a_reference_is_retired_by_hand_and_all_restored(client: Client, scene: 
 def test_a_scene_that_adopts_says_how_long_it_keeps(client: Client, scene: str) -> None:
     (said,) = client.update_scene(scene, adoption=AdoptionPolicy()).warnings
     assert said.startswith("what it adopts is deleted 24 h after it was adopted")
+    assert client.get_scene(scene).warnings == (said,)
+    assert client.create_scene("keeps", adoption=AdoptionPolicy()).warnings == (said,)
+    client.delete_scene("keeps")
     assert client.update_scene(scene, adoption=None).warnings == ()
 
 
@@ -159,7 +196,7 @@ def test_places_that_need_a_new_survey_are_named(client: Client, server: Running
         [key],
         lambda _, it: adoption.outdated(replace(it, surveyed_share=0.2, photograph_count=5)),
     )
-    (warning,) = client.get_scene(adopting).warnings
+    _, warning = client.get_scene(adopting).warnings
     assert warning.startswith("photographs around r2 at (2.00, 2.00, -1.00) show too little of what was surveyed")
     places = {it.reference_id: it.place for it in client.list_references(adopting)}
     assert places == {"r0": None, "r1": None, "r2": PlaceState(0.2, 5, 0)}

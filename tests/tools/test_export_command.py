@@ -117,6 +117,41 @@ def test_adopted_references_are_exported_apart(
 
 
 @pytest.mark.parametrize("layout", ["cameras", "kapture"])
+def test_an_import_renews_no_age_of_adopted_ones(
+    server: RunningServer, client: Client, filled: tuple[str, object], tmp_path: Path, layout: str
+) -> None:
+    export_of(server, client, filled, tmp_path / "out", "--format", layout)
+    adopted = client.get_reference(filled[0], "kept").provenance.adopt_time
+    assert adopted is not None
+    copy = f"{filled[0]}-copy"
+    done = run("import", tmp_path / "out", copy, "--skip-check", "--address", server.address)
+    assert done.exit_code == 0, done.output
+    assert client.get_reference(copy, "kept").provenance.adopt_time == adopted
+    client.delete_scene(copy)
+
+
+def test_what_nothing_vouches_for_or_is_too_old_is_not_imported(
+    server: RunningServer, client: Client, filled: tuple[str, object], tmp_path: Path
+) -> None:
+    out, copy = tmp_path / "out", f"{filled[0]}-copy"
+    export_of(server, client, filled, out, "--adopted", "only")
+    done = run("import", out, copy, "--skip-check", "--address", server.address)
+    assert done.exit_code == 1
+    assert "are not in the scene: r.0-_A, r.2-_A" in " ".join(done.output.split())
+    assert list(client.list_references(copy)) == []
+    client.delete_scene(copy)
+    file = out / "cameras.json"
+    content = json.loads(file.read_text())
+    content["frames"][0]["provenance"]["adopt_time"] = "2026-01-01T00:00:00+00:00"
+    file.write_text(json.dumps(content))
+    client.delete_reference(filled[0], "kept")
+    done = run("import", out, filled[0], "--skip-check", "--address", server.address)
+    assert done.exit_code == 1
+    assert "is more than 24 h ago: older ones are deleted" in " ".join(done.output.split())
+    assert "kept" not in {it.reference_id for it in client.list_references(filled[0])}
+
+
+@pytest.mark.parametrize("layout", ["cameras", "kapture"])
 def test_where_a_scene_is_on_the_earth_goes_along(
     server: RunningServer, client: Client, filled: tuple[str, list[NewReference]], layout: str, tmp_path: Path
 ) -> None:

@@ -1,15 +1,20 @@
 """What operators do about adopted and retired references."""
 
+from contextlib import suppress
 from datetime import datetime
 from typing import Any
 
 from .. import wire
 from ..connection import Connection
+from ..errors import NotFound
 from ..messages import reference_from_message
 from ..names import parse_reference_name, reference_name, scene_name
 from ..results import Reference
 from ..v1 import reference_service_pb2 as pb
 from .references import delete_reference, list_references
+
+_NO_REFERENCE = "adopted-none"
+"""An id that no photograph has, whose deletion changes nothing and requires the role."""
 
 
 async def retire_reference(
@@ -69,6 +74,8 @@ async def undo_adoption(
 ) -> list[Reference]:
     """Deletes the references that a scene has adopted since a time, one by one, and returns them.
 
+    A token of a lower role than `write` is refused (PermissionDenied), also where there is nothing to delete.
+
     Args:
         scene: the scene.
         since: the time, with time zone, by the server's clock.
@@ -76,7 +83,10 @@ async def undo_adoption(
     """
     _check_zone(since)
     adopted = [it async for it in list_references(connection, scene, only_adopted=True, timeout_s=timeout_s)]
-    chosen = [it for it in adopted if it.create_time >= since]
+    chosen = [it for it in adopted if (it.provenance.adopt_time or it.create_time) >= since]
     for it in chosen:
         await delete_reference(connection, it.scene_id, it.reference_id, timeout_s=timeout_s)
+    if not chosen:  # the interface has no method of its own, which would refuse the token
+        with suppress(NotFound):
+            await delete_reference(connection, scene, _NO_REFERENCE, timeout_s=timeout_s)
     return chosen

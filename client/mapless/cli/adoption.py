@@ -21,20 +21,20 @@ def add_policy(command: argparse.ArgumentParser) -> None:
     )
     for flag, kind, unit, text in (
         ("most", int, "N", f"most adopted references at a place (default: {default.most_per_place})"),
-        ("trust", float, "TRUST", f"least trust of an answer (default: {default.min_trust:g})"),
-        ("radius", float, "M", f"largest 68 %% radius, m or the scene's unit (default: {default.max_radius_m:g})"),
+        ("trust", float, "TRUST", f"least trust of an answer, above 0 (default: {default.min_trust:g})"),
+        ("radius", float, "M", f"largest 68 %% radius, m (default: {default.max_radius_m:g}) or the scene's unit"),
         ("surveyed", float, "SHARE", f"least share of surveyed matches (default: {default.min_surveyed_share:g})"),
     ):
         group.add_argument(f"--adopt-{flag}", type=kind, metavar=unit, help=text)
 
 
 def policy_of(
-    arguments: argparse.Namespace, current: AdoptionPolicy | None = None, is_arbitrary: bool = False
+    arguments: argparse.Namespace, current: AdoptionPolicy | None = None, new_unit: str = ""
 ) -> AdoptionPolicy | None:
     """The adoption policy that the flags give, with the `current` one's other values; None without `--adopt`.
 
-    ValueError for a value that is out of bounds, or without `--adopt`; and without a radius for a scene whose unit is
-    arbitrary, for which there is no default.
+    ValueError for a value that is out of bounds, or without `--adopt`; and without a radius where it has a new unit, in
+    which neither the default nor the current one is.
     """
     given = {
         "most_per_place": arguments.adopt_most,
@@ -43,8 +43,8 @@ def policy_of(
         "min_surveyed_share": arguments.adopt_surveyed,
     }
     given = {name: value for name, value in given.items() if value is not None}
-    if arguments.adopt and is_arbitrary and current is None and arguments.adopt_radius is None:
-        raise ValueError("the scene's unit is arbitrary: give the largest 68 % radius in it, --adopt-radius")
+    if arguments.adopt and new_unit and arguments.adopt_radius is None:
+        raise ValueError(f"the scene's unit is {new_unit}: give the largest 68 % radius in it, --adopt-radius")
     if arguments.adopt:
         return replace(current or AdoptionPolicy(), **given)
     if given:
@@ -88,6 +88,8 @@ def add_actions(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") 
 def _time(text: str) -> datetime:
     try:
         found = datetime.fromisoformat(text)
+        if not text.startswith(f"{found:%Y-%m-%d}"):  # Python 3.11 takes more than 3.10
+            raise ValueError
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no time such as 2026-11-29T18:00") from None
     return found.replace(tzinfo=timezone.utc) if found.tzinfo is None else found
@@ -101,15 +103,21 @@ def retire_reference(client: Client, arguments: argparse.Namespace) -> int:
 
 def restore_references(client: Client, arguments: argparse.Namespace) -> int:
     """Has retired references chosen again: one, all, or those of a place or since a time."""
-    is_some = arguments.all or bool(arguments.place) or arguments.since is not None
-    if bool(arguments.reference) == is_some:
-        raise ValueError("give one reference, or --all, or --place and --since or one of these")
-    if is_some:
+    some = {"--place": bool(arguments.place), "--since": arguments.since is not None}
+    narrowing = [flag for flag, is_given in some.items() if is_given]
+    given = ["REFERENCE"] * bool(arguments.reference) + ["--all"] * arguments.all + narrowing
+    if not given:
+        raise ValueError("which ones? Give a REFERENCE, or --place, --since or both, or --all")
+    if len(given) > 1 and given != narrowing:
+        raise ValueError(f"{given[0]} does not go together with {' and '.join(given[1:])}")
+    if not arguments.reference:
         ids = client.restore_references(arguments.scene, since=arguments.since, place=arguments.place)
         number = f"{len(ids)} reference{'' if len(ids) == 1 else 's'} chosen for photographs again"
         return show(arguments, ids, [number, *(f"  {it}" for it in ids)])
+    was_retired = client.get_reference(arguments.scene, arguments.reference).retire_time is not None
     found = client.restore_reference(arguments.scene, arguments.reference)
-    return show(arguments, found, [f"{found.reference_id} is chosen for photographs"])
+    text = "is chosen for photographs again" if was_retired else "was not retired"
+    return show(arguments, found, [f"{found.reference_id} {text}"])
 
 
 def undo_adoption(client: Client, arguments: argparse.Namespace) -> int:
@@ -127,7 +135,8 @@ def adopted_table(references: list[Reference]) -> list[str]:
     for it in references:
         vouchers = ", ".join(one.reference_id for one in it.provenance.vouchers[:3])
         share = f"{100 * it.provenance.surveyed_share:.0f} %"
-        rows.append((it.reference_id, share, vouchers, f"{it.create_time:%Y-%m-%d %H:%M}", _retired(it)))
+        adopted = it.provenance.adopt_time or it.create_time
+        rows.append((it.reference_id, share, vouchers, f"{adopted:%Y-%m-%d %H:%M}", _retired(it)))
     return table(("REFERENCE", "SURVEYED", "VOUCHERS", "ADOPTED", "RETIRED ON"), rows)
 
 

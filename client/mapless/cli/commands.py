@@ -44,8 +44,9 @@ def create_scene(client: Client, arguments: argparse.Namespace) -> int:
         down_in_world=down,
         arbitrary_unit=is_arbitrary,
         labels=parse_labels(arguments.label),
-        adoption=policy_of(arguments, is_arbitrary=arguments.unit == "arbitrary"),
+        adoption=policy_of(arguments, new_unit="arbitrary" if is_arbitrary else ""),
     )
+    _warn(scene.warnings)
     return show(arguments, scene, _scene_card(scene))
 
 
@@ -69,7 +70,9 @@ def update_scene(client: Client, arguments: argparse.Namespace) -> int:
     if policy is not None:
         there = client.get_scene(arguments.scene)
         is_arbitrary = changes.get("arbitrary_unit", there.arbitrary_unit)
-        changes["adoption"] = policy_of(arguments, there.adoption, is_arbitrary)
+        is_new = is_arbitrary if there.adoption is None else is_arbitrary != there.arbitrary_unit
+        unit = "arbitrary" if is_arbitrary else "the metre"
+        changes["adoption"] = policy_of(arguments, there.adoption, unit if is_new else "")
     scene = client.update_scene(arguments.scene, **changes)
     _warn(scene.warnings)
     return show(arguments, scene, _scene_card(scene))

@@ -34,9 +34,7 @@ def add_report(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -
     )
     report.add_argument("scene")
     begin = report.add_mutually_exclusive_group()
-    begin.add_argument(
-        "--weeks", type=_weeks, default=DEFAULT_WEEKS, metavar="N", help=f"so many weeks (default: {DEFAULT_WEEKS})"
-    )
+    begin.add_argument("--weeks", type=_weeks, metavar="N", help=f"so many weeks (default: {DEFAULT_WEEKS})")
     begin.add_argument("--since", type=day_of, metavar="DAY", help="first day, such as 2026-11-02, instead of --weeks")
     report.add_argument("--until", type=day_of, metavar="DAY", help="last day (default: today)")
     report.add_argument("--by-day", action="store_true", help="count days instead of weeks")
@@ -60,6 +58,8 @@ def day_of(text: str) -> date:
     """A day of a flag; ArgumentTypeError names a wrong one."""
     try:
         day = date.fromisoformat(text)
+        if text != day.isoformat():  # Python 3.11 takes more than 3.10
+            raise ValueError
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no day such as 2026-11-02") from None
     if day < EPOCH:
@@ -82,10 +82,10 @@ def scene_report(client: Client, arguments: argparse.Namespace) -> int:
     first_day, last_day = arguments.since, arguments.until
     if first_day is not None and last_day is not None and first_day > last_day:
         raise ValueError(f"--since {first_day} is after --until {last_day}")
-    if last_day is not None or arguments.weeks != DEFAULT_WEEKS or arguments.by_day:
+    if last_day is not None or arguments.weeks is not None or arguments.by_day:
         today = client.get_scene_report(arguments.scene, days_per_period=1).last_day
         if first_day is None:
-            first_day = first_day_of(arguments.weeks, last_day or today)
+            first_day = first_day_of(arguments.weeks or DEFAULT_WEEKS, last_day or today)
         last_day = last_day_of(last_day, today)
     report = client.get_scene_report(
         arguments.scene,
@@ -151,6 +151,7 @@ def report_text(report: SceneReport, to_do: Sequence[str] = ()) -> list[str]:
             lines += wrap(f"{i}. {it.message}", WIDTH, subsequent_indent="   ")
         if (more := len(report.suggestions) - SUGGESTIONS) > 0:
             lines.append(f"and {more} more")
+        lines += ["Photographs of elsewhere look as if references were missing: see whether any come from there."]
     if found := [it for it in rejections_of(report.periods) if it in WORDS]:
         lines += ["", *map(explained, found)]
     return lines

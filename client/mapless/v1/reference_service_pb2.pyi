@@ -198,18 +198,20 @@ class PlaceState(_message.Message):
     def __init__(self, surveyed_share: _Optional[float] = ..., photograph_count: _Optional[int] = ..., contradiction_count: _Optional[int] = ...) -> None: ...
 
 class Provenance(_message.Message):
-    __slots__ = ("source", "accuracy", "surveyed_share", "vouchers", "covariance")
+    __slots__ = ("source", "accuracy", "surveyed_share", "vouchers", "covariance", "adopt_time")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     ACCURACY_FIELD_NUMBER: _ClassVar[int]
     SURVEYED_SHARE_FIELD_NUMBER: _ClassVar[int]
     VOUCHERS_FIELD_NUMBER: _ClassVar[int]
     COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    ADOPT_TIME_FIELD_NUMBER: _ClassVar[int]
     source: PoseSource
     accuracy: _localization_service_pb2.Accuracy
     surveyed_share: float
     vouchers: _containers.RepeatedCompositeFieldContainer[Voucher]
     covariance: _localization_service_pb2.PoseCovariance
-    def __init__(self, source: _Optional[_Union[PoseSource, str]] = ..., accuracy: _Optional[_Union[_localization_service_pb2.Accuracy, _Mapping]] = ..., surveyed_share: _Optional[float] = ..., vouchers: _Optional[_Iterable[_Union[Voucher, _Mapping]]] = ..., covariance: _Optional[_Union[_localization_service_pb2.PoseCovariance, _Mapping]] = ...) -> None: ...
+    adopt_time: _timestamp_pb2.Timestamp
+    def __init__(self, source: _Optional[_Union[PoseSource, str]] = ..., accuracy: _Optional[_Union[_localization_service_pb2.Accuracy, _Mapping]] = ..., surveyed_share: _Optional[float] = ..., vouchers: _Optional[_Iterable[_Union[Voucher, _Mapping]]] = ..., covariance: _Optional[_Union[_localization_service_pb2.PoseCovariance, _Mapping]] = ..., adopt_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ...) -> None: ...
 
 class Voucher(_message.Message):
     __slots__ = ("reference_id", "match_count")
@@ -243,10 +245,12 @@ class CreateSceneRequest(_message.Message):
     def __init__(self, scene_id: _Optional[str] = ..., datum: _Optional[_Union[Datum, _Mapping]] = ..., down_in_world: _Optional[_Union[_geometry_pb2.Vector3, _Mapping]] = ..., arbitrary_unit: bool = ..., labels: _Optional[_Mapping[str, str]] = ..., adoption: _Optional[_Union[AdoptionPolicy, _Mapping]] = ...) -> None: ...
 
 class CreateSceneResponse(_message.Message):
-    __slots__ = ("scene",)
+    __slots__ = ("scene", "warnings")
     SCENE_FIELD_NUMBER: _ClassVar[int]
+    WARNINGS_FIELD_NUMBER: _ClassVar[int]
     scene: Scene
-    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ...) -> None: ...
+    warnings: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class GetSceneRequest(_message.Message):
     __slots__ = ("name",)

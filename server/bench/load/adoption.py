@@ -96,7 +96,7 @@ class _Asked:
 
     def store(self, place: Place) -> None:
         """Two scenes with the place's references, of which one adopts."""
-        for scene, policy in ((PLAIN, None), (ADOPTING, AdoptionPolicy(min_trust=0.0, max_radius_m=10.0))):
+        for scene, policy in ((PLAIN, None), (ADOPTING, AdoptionPolicy(min_trust=1e-6, max_radius_m=10.0))):
             self._client.create_scene(scene, adoption=policy)
             self._client.add_references(scene, [it.reference() for it in place.references])
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
@@ -30,6 +30,7 @@ from mapless_server.store import (
     SceneAttributes,
     SceneRecord,
     Store,
+    WrongRadius,
 )
 
 from .messages.enums import message_of
@@ -55,6 +56,7 @@ from .messages.references import (
     new_provenance,
     outdated_places,
     reference_to_message,
+    require_radius,
     restored_from_message,
     retired_to_message,
     scene_to_message,
@@ -113,7 +115,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         labels = labels_from_message(request.labels, "labels")
         check_stays_in_reach(call, scene_id, labels, "scene_id")
         scene = await self._stored(self._store.create_scene, key, attributes, labels)
-        return pb.CreateSceneResponse(scene=scene_to_message(scene))
+        warnings = [] if scene.attributes.adoption is None else [kept_adopted(self._adopted_hours)]
+        return pb.CreateSceneResponse(scene=scene_to_message(scene), warnings=warnings)
 
     async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
         """Implements ReferenceService.GetScene."""
@@ -124,6 +127,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         warnings = dict.fromkeys(agreement.warnings(scene.attributes.arbitrary_unit))
         if not agreement.contradicts_itself:  # else what its references say of lenses is of no use
             warnings |= await self._stored(self._lens_warnings, key)
+        if scene.attributes.adoption is not None:
+            warnings[kept_adopted(self._adopted_hours)] = None
         warnings |= await self._stored(self._outdated_places, key)
         return pb.GetSceneResponse(
             scene=scene_to_message(scene),
@@ -167,6 +172,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         changes, limit = changes_from_message(request), call.principal.limit
         if "labels" in changes and tenant_of(key) != NOWHERE:
             check_stays_in_reach(call, scene_id_of(key), changes["labels"], "scene.labels")
+        if changes.get("adoption") is not None and await self._stored(self._is_arbitrary_with, key, changes):
+            require_radius(request.scene.adoption, "scene.adoption")
         try:
             scene = await self._stored(partial(self._store.update_scene, key, **changes, limit=limit))
         except ContradictingDown as error:
@@ -175,12 +182,19 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         except DatumWithoutMetres as error:
             field = "datum" if changes.get("datum") else "arbitrary_unit"
             raise FieldError(f"scene.{field}", str(error)) from None
+        except WrongRadius as error:
+            raise FieldError("scene.adoption.max_radius_m", str(error)) from None
         warnings: list[str] = []
         if changes.keys() - {"calibration", "labels"}:
             warnings = await self._stored(self._contradictions, scene, MAX_COMPARED, call)
         if changes.get("adoption") is not None:
             warnings.append(kept_adopted(self._adopted_hours))
         return pb.UpdateSceneResponse(scene=scene_to_message(scene), warnings=warnings)
+
+    def _is_arbitrary_with(self, key: SceneKey, changes: Mapping[str, object]) -> bool:
+        """Whether a scene's unit is arbitrary after changes."""
+        given = changes.get("arbitrary_unit")
+        return self._store.get_attributes(key).arbitrary_unit if given is None else bool(given)
 
     def _contradictions(
         self, scene: SceneRecord, count: int, call: Call, added: Sequence[RigidTransform] = ()
@@ -307,9 +321,17 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
         since, place_id = restored_from_message(request, scene_id_of(scene_key))
+        if place_id != "" and await self._stored(self._is_adopted, scene_key, place_id):
+            raise FieldError("place", f"{names.shown(place_id)} was adopted: name the surveyed reference of its place")
         restored = await self._stored(adoption.restore, self._store, scene_key, since, place_id)
         made = [names.reference_name(scene_id_of(scene_key), it) for it in restored]
         return pb.RestoreReferencesResponse(references=made)
+
+    def _is_adopted(self, scene_key: SceneKey, reference_id: str) -> bool:
+        from mapless_server.store import adoption
+
+        keys = list(self._store.find_keys(scene_key, [reference_id]).values())
+        return adoption.places_of(self._store.database, keys) != keys
 
     async def RestoreReference(self, request: pb.RestoreReferenceRequest, call: Call) -> pb.RestoreReferenceResponse:
         """Implements ReferenceService.RestoreReference."""
@@ -396,7 +418,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         )
         limits = self._engine().options.image_limits
         photo = with_depth(photo_from_message(reference, path, limits), reference, path, limits)
-        return Draft(reference_id, photo, world_from_camera, new_provenance(reference, path))
+        return Draft(reference_id, photo, world_from_camera, new_provenance(reference, path, self._adopted_hours))
 
     async def _add(
         self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call

@@ -26,6 +26,7 @@ from .records import (
     SceneRecord,
     SceneState,
     SelfCalibration,
+    WrongRadius,
     calibration_kind,
 )
 from .rows import time_us

@@ -1,11 +1,14 @@
 """The values that the store takes and returns."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from enum import Enum
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +17,15 @@ from mapless.depth import DepthImage
 from mapless.geodesy import Datum
 from mapless.geometry import Array, Camera, RigidTransform
 from mapless.provenance import GIVEN_POSE, Provenance
-from mapless.scenes import MAX_FACTOR, MIN_FACTOR, AdoptionPolicy, Calibration, Vector
+from mapless.scenes import (
+    LARGEST_RADIUS_M,
+    LEAST_RADIUS_M,
+    MAX_FACTOR,
+    MIN_FACTOR,
+    AdoptionPolicy,
+    Calibration,
+    Vector,
+)
 from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
@@ -28,6 +39,10 @@ class ContradictingDown(ValueError):
 
 class DatumWithoutMetres(ValueError):
     """A scene has a datum, although its unit of length is not the metre."""
+
+
+class WrongRadius(ValueError):
+    """The radius of a scene's adoption policy is none for its unit of length."""
 
 
 CALIBRATION_MODEL = 5
@@ -87,7 +102,8 @@ class SceneAttributes:
     self-calibrations, one for each kind of answers, and the contradiction, a sentence if the scene contradicts itself,
     are only filled for answers. The adoption policy says which localized photographs become references; None for none.
     ContradictingDown if datum and down_in_world do not belong to the same world;
-    DatumWithoutMetres if there is a datum, but the unit of length is arbitrary instead of the metre.
+    DatumWithoutMetres if there is a datum, but the unit of length is arbitrary instead of the metre; WrongRadius if the
+    adoption policy's radius is out of bounds, in metres.
     """
 
     datum: Datum | None = None
@@ -111,6 +127,10 @@ class SceneAttributes:
     def __post_init__(self) -> None:
         if self.datum is not None and self.arbitrary_unit:
             raise DatumWithoutMetres("needs a scene in metres: the unit of length of this one is arbitrary")
+        if self.adoption is not None and not self.arbitrary_unit:
+            radius_m = self.adoption.max_radius_m
+            if not LEAST_RADIUS_M <= radius_m <= LARGEST_RADIUS_M:
+                raise WrongRadius(f"must be {LEAST_RADIUS_M:g} to {LARGEST_RADIUS_M:g} metres, is {radius_m:g}")
         if self.datum is None or self.down_in_world is None:
             return
         cosine = float(self.datum.down_in_world() @ self.down_in_world)
@@ -120,6 +140,13 @@ class SceneAttributes:
                 f"is {angle_deg:.0f} degrees off the datum's down; its enu_from_world must turn the world's axes to "
                 "east, north and up"
             )
+
+    def changed(self, changes: Mapping[str, Any]) -> SceneAttributes:
+        """The attributes with other values, by name; WrongRadius if the unit changes without the adoption policy."""
+        made = replace(self, **changes)
+        if self.adoption is not None and "adoption" not in changes and made.unit != self.unit:
+            raise WrongRadius(f"is in {self.unit}: give the policy with the unit, its radius in {made.unit}")
+        return made
 
     def self_calibration(self, kind: str) -> SelfCalibration | None:
         """The self-calibration of this kind of answers, if there is one."""

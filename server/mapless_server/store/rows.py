@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Row
 
 from mapless.depth import DepthImage
+from mapless.provenance import ADOPTED
 from mapless_server.errors import DataLoss
 from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
@@ -107,6 +108,9 @@ def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) ->
     """The record of a reference about to be stored, with a new key; ValueError if it has no features."""
     if not new.views:
         raise ValueError(f"reference {new.reference_id!r} has no features of any extractor")
+    provenance = new.provenance
+    if provenance.source == ADOPTED and provenance.adopt_time is None:
+        provenance = replace(provenance, adopt_time=create_time)
     return ReferenceRecord(
         scene_key=scene_key,
         reference_id=new.reference_id,
@@ -117,7 +121,7 @@ def new_record(scene_key: SceneKey, new: NewReference, create_time: datetime) ->
         feature_count=len(next(iter(new.views.values())).features),
         create_time=create_time,
         mask_sha256=hashlib.sha256(new.mask).hexdigest() if new.mask else "",
-        provenance=new.provenance,
+        provenance=provenance,
         depth_sha256="" if new.depth is None else new.depth.sha256,
     )
 
@@ -188,7 +192,7 @@ def adopted_row(record: ReferenceRecord, new: NewReference) -> dict[str, Any]:
         "reference_key": record.key,
         "place_key": new.place_key,
         "usefulness": new.usefulness,
-        "adopt_time_us": time_us(record.create_time),
+        "adopt_time_us": time_us(record.provenance.adopt_time or record.create_time),
         "adopted_by": new.adopted_by,
     }
 

@@ -196,8 +196,8 @@ class Store(StoreReader):
         Damaged attributes are replaced if datum, down_in_world and calibration are given; then the unit is the metre
         and nothing is adopted unless that is given. NotFound if there is no such scene; DataLoss if an attribute that
         is not given is damaged; ContradictingDown if datum and down_in_world do not belong to the same world;
-        DatumWithoutMetres if there would be a datum, and an arbitrary unit. A scene that is not within the limit, if
-        there is one, is not there.
+        DatumWithoutMetres if there would be a datum, and an arbitrary unit; WrongRadius if the policy is wrong, or the
+        unit changes without it. A scene that is not within the limit, if there is one, is not there.
         """
         if isinstance(calibration, Calibration):
             calibration = replace(calibration, create_time=_now())
@@ -216,7 +216,7 @@ class Store(StoreReader):
             except DataLoss:
                 if not replaces_damaged:
                     raise
-            row = rows.attributes_row(scene_key, replace(found, **changes))
+            row = rows.attributes_row(scene_key, found.changed(changes))
             connection.execute(update(tables.scene).where(tables.scene.c.scene_id == scene_key).values(row))
             if labels is not UNCHANGED:
                 queries.replace_labels(connection, scene_key, labels)

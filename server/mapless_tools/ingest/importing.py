@@ -1,7 +1,7 @@
 """An import: reads, selects, checks, compares with the scene, stores, and reports."""
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +11,7 @@ from rich.console import Console
 from mapless import Client, DeadlineExceeded, MaplessError, Reference, Unavailable
 from mapless.labels import check_labels
 from mapless.names import check_id
+from mapless.provenance import ADOPTED
 from mapless_server.errors import InvalidArgument
 from mapless_server.images import ImageLimits, decode_depth
 from mapless_server.method.pairs.readings.depth import implausible_depth
@@ -182,7 +183,8 @@ def read_frames(folder: Path, options: ImportOptions) -> tuple[Dataset, tuple[Fr
     if options.max_count is not None and len(frames) > options.max_count:
         step = len(frames) / options.max_count
         frames = [frames[int(i * step)] for i in range(options.max_count)]
-    return dataset, tuple(_prefixed(frame, options.id_prefix) for frame in frames)
+    names = {frame.name for frame in dataset.frames}
+    return dataset, tuple(_prefixed(frame, options.id_prefix, names) for frame in frames)
 
 
 def much_ignored(frames: Sequence[Frame]) -> list[str]:
@@ -200,6 +202,23 @@ def leave_same_poses(report: ImportReport, verdict: Verdict) -> None:
     for group in verdict.same_pose:
         reason = SAME_POSE.format(count=len(group) - 1)
         report.refused += [Refusal(report.chosen[i].name, reason) for i in group]
+
+
+MOST_LOST_SHARE = 0.5
+"""A server retires adopted references of which a larger share of the vouching matches is with missing references."""
+
+
+def leave_unvouched(report: ImportReport, existing: Sequence[Reference]) -> None:
+    """Refuses the adopted frames that the server would retire, as what vouches for them is not in the scene."""
+    there = {it.reference_id for it in existing if it.provenance.source != ADOPTED and it.retire_time is None}
+    there |= {it.name for it in report.chosen if it.provenance.source != ADOPTED} - {it.frame for it in report.refused}
+    for frame in report.chosen:
+        vouchers = frame.provenance.vouchers
+        missing = [it for it in vouchers if it.reference_id not in there]
+        if sum(it.match_count for it in missing) > MOST_LOST_SHARE * sum(it.match_count for it in vouchers):
+            named = ", ".join(it.reference_id for it in missing[:3]) + (", ..." if len(missing) > 3 else "")
+            reason = f"adopted, and the surveyed references that its pose rests on are not in the scene: {named}"
+            report.refused.append(Refusal(frame.name, reason))
 
 
 def refuse_wrong_images(report: ImportReport) -> None:
@@ -240,6 +259,7 @@ def _store(report: ImportReport, options: ImportOptions, settings: Settings, con
             attributes = SceneAttributes(scene.datum, scene.down_in_world, arbitrary_unit=scene.arbitrary_unit)
             _warn(report, contradictions(poses, attributes))
             _warn(report, [another_unit([it.world_from_camera for it in existing], poses)])
+            leave_unvouched(report, existing)
             Uploader(client, KnownReferences(existing), report, options.parallel, progress).run()
             report.pending = client.get_scene(report.scene).pending_work
     except WrongUnit as error:
@@ -309,13 +329,18 @@ def _reported(report: ImportReport, file: Path | None) -> Iterator[None]:
             write_json(file, to_json(report))
 
 
-def _prefixed(frame: Frame, prefix: str) -> Frame:
+def _prefixed(frame: Frame, prefix: str, names: Collection[str]) -> Frame:
+    """The frame with the prefix before its name, and before those of its vouchers that are among the folder's."""
     if not prefix:
         return frame
     name = f"{prefix}{frame.name}"
     if len(name) > MAX_NAME_LENGTH:
         raise ValueError(f"{name} is longer than the {MAX_NAME_LENGTH} characters that an id may have")
-    return replace(frame, name=name)
+    vouchers = tuple(
+        replace(it, reference_id=f"{prefix}{it.reference_id}") if it.reference_id in names else it
+        for it in frame.provenance.vouchers
+    )
+    return replace(frame, name=name, provenance=replace(frame.provenance, vouchers=vouchers))
 
 
 def _print(line: str) -> None:

@@ -18,6 +18,7 @@ from typing import NoReturn
 
 from mapless import Client, DepthImage, NewReference, errors
 from mapless.depth import depth_from_message, depth_to_message
+from mapless.provenance import ADOPTED
 from mapless.wire import FieldError
 from mapless_server.errors import InvalidArgument as BadImage
 from mapless_server.images import ANY_SIZE, ImageLimits, check_depth, check_mask, image_size
@@ -54,17 +55,23 @@ class Uploader:
         self._lock = threading.Lock()
 
     def run(self) -> None:
-        """Stores the chosen frames that are not refused already; an interruption stops it soon and is raised."""
+        """Stores the chosen frames that are not refused already; an interruption stops it soon and is raised.
+
+        Adopted ones are stored last, so that what vouches for them is there before.
+        """
         refused = {it.frame for it in self._report.refused[len(self._report.dataset.refused) :]}
         frames = [frame for frame in self._report.chosen if frame.name not in refused]
-        batches = (frames[i : i + BATCH_COUNT] for i in range(0, len(frames), BATCH_COUNT))
+        adopted = [frame for frame in frames if frame.provenance.source == ADOPTED]
+        surveyed = [frame for frame in frames if frame.provenance.source != ADOPTED]
         self._progress("storing references", 0, len(frames))
         start_s = time.monotonic()
         threads = ThreadPoolExecutor(self._parallel, "import")
         try:
-            workers = [threads.submit(self._work, batches) for _ in range(self._parallel)]
-            for worker in workers:
-                worker.result()
+            for some in (surveyed, adopted):
+                batches = (some[i : i + BATCH_COUNT] for i in range(0, len(some), BATCH_COUNT))
+                workers = [threads.submit(self._work, batches) for _ in range(self._parallel)]
+                for worker in workers:
+                    worker.result()
         except BaseException:
             self._stop.set()
             self._client.close()  # ends the calls in flight

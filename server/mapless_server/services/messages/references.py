@@ -4,13 +4,13 @@ import base64
 import binascii
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from typing import Any, TypeVar
 
 from mapless import names, wire
 from mapless.depth import implausible_median
 from mapless.labels import check_labels
-from mapless.provenance import GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
+from mapless.provenance import ADOPTED, GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
 from mapless.scenes import (
     Calibration,
     adoption_from_message,
@@ -33,6 +33,7 @@ from mapless_server.store import (
     RetirementReason,
     SceneAttributes,
     SceneRecord,
+    WrongRadius,
 )
 
 from .enums import message_of
@@ -101,8 +102,9 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
     if reference.retired is not None:
         message.retire_time.FromDatetime(reference.retired.time)
         message.retirement = retirement_of(reference.retired)
-    if reference.standing is not None:
-        known = reference.standing
+    known = reference.standing
+    is_place = reference.provenance.source != ADOPTED  # adopted ones belong to the places of surveyed ones
+    if is_place and known is not None and (known.photograph_count or known.contradiction_count):
         message.place.surveyed_share = 1.0 if known.surveyed_share is None else known.surveyed_share
         message.place.photograph_count = known.photograph_count
         message.place.contradiction_count = known.contradiction_count
@@ -113,7 +115,8 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
 _RETIRED_BECAUSE = {
     RetirementReason.CONTRADICTED: "photographs from about its viewpoint do not show what it shows",
     RetirementReason.SURVEY_OUTDATED: "photographs of its place show too little of what was surveyed: survey it again",
-    RetirementReason.VOUCHERS_GONE: "the surveyed references that its pose rests on were deleted or retired",
+    RetirementReason.VOUCHERS_GONE: "the surveyed references that its pose rests on are not in the scene: "
+    "they were deleted or retired, or never stored",
     RetirementReason.BY_OPERATOR: "by request of a caller who may change the scene",
 }
 
@@ -123,6 +126,8 @@ def retirement_of(retired: Retirement) -> str:
     return f"retired on {retired.time:%Y-%m-%d %H:%M} UTC: {_RETIRED_BECAUSE[retired.reason]}"
 
 
+CLOCKS_DIFFER = timedelta(minutes=1)
+"""Clocks of servers and of those who import may differ by so much."""
 MOST_NAMED = 10
 """Places that one warning names."""
 
@@ -154,15 +159,27 @@ def kept_adopted(hours: float) -> str:
     )
 
 
-def new_provenance(reference: pb.Reference, field: str) -> Provenance:
-    """How the pose of a reference to be created is known; FieldError names what is wrong."""
+def new_provenance(reference: pb.Reference, field: str, adopted_hours: float) -> Provenance:
+    """How the pose of a reference to be created is known; FieldError names what is wrong.
+
+    Adopted references are kept for `adopted_hours`; one that is older, or of a time to come, is refused.
+    """
     if not reference.HasField("provenance"):
         return GIVEN_POSE
     message, path = reference.provenance, joined(field, "provenance")
     sources: wire.ProtoEnum = pb.PoseSource
     if message.source not in sources.values():
         raise FieldError(joined(path, "source"), f"must be one of PoseSource's values, is {message.source}")
+    if message.HasField("adopt_time"):
+        check_time(message.adopt_time, joined(path, "adopt_time"))
     found = provenance_from_message(message, path)
+    if found.adopt_time is not None:
+        age = datetime.now(timezone.utc) - found.adopt_time
+        if not -CLOCKS_DIFFER <= age <= timedelta(hours=adopted_hours):
+            fault = (
+                "is to come" if age < timedelta() else f"is more than {adopted_hours:g} h ago: older ones are deleted"
+            )
+            raise FieldError(joined(path, "adopt_time"), f"{found.adopt_time:%Y-%m-%d %H:%M} UTC {fault}")
     return found if message.source else replace(found, source=GIVEN)
 
 
@@ -256,6 +273,8 @@ def scene_to_message(scene: SceneRecord) -> pb.Scene:
 
 def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
     """Reads the attributes of a scene to be created; FieldError names a wrong field."""
+    if request.HasField("adoption") and request.arbitrary_unit:
+        require_radius(request.adoption, "adoption")
     try:
         return SceneAttributes(
             datum_from_message(request.datum, "datum") if request.HasField("datum") else None,
@@ -269,6 +288,16 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
         raise FieldError("down_in_world", str(error)) from None
     except DatumWithoutMetres as error:
         raise FieldError("datum", str(error)) from None
+    except WrongRadius as error:
+        raise FieldError("adoption.max_radius_m", str(error)) from None
+
+
+def require_radius(adoption: pb.AdoptionPolicy, field: str) -> None:
+    """Raises FieldError for a policy without a radius, in a scene whose unit is arbitrary."""
+    if not adoption.max_radius_m:
+        raise FieldError(
+            joined(field, "max_radius_m"), "is required: the scene's unit is arbitrary, so it has no default"
+        )
 
 
 def labels_from_message(labels: Mapping[str, str], field: str) -> dict[str, str]:
