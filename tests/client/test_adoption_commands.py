@@ -53,6 +53,7 @@ def test_adopted_references_are_shown_and_undone(run: Run, client: Client, scene
     _, text, _ = run("reference", "list", scene, "--adopted")
     assert [line.split()[:3] for line in text.splitlines()[1:]] == [["new", "50", "%"]]
     assert "r0, r1" in text
+    assert "references  4 (1 adopted)\n" in run("scene", "get", scene)[1]
     shown = run("reference", "show", scene, "new")[1]
     for said in ("adopted from a localized photograph, within 0.02 m (95 %)", "50 % of its matches", "r0 ", ", r1 "):
         assert said in shown

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from support.html import Page
 from typer.testing import CliRunner
 
@@ -134,6 +135,16 @@ class TestPlan:
         axes = drawn({}, {2: suggestion("a", (3.0, 5.0, 1.0))})
         (number,) = axes.texts
         assert (number.get_text(), getattr(number, "xy")) == ("2", (3.0, 5.0))  # noqa: B009 - of annotations alone
+
+    def test_a_suggestion_covers_no_ring(self) -> None:
+        (found,) = places_of(report(place("a", upright(4, 4), 0, {"GATE": 9})), [])
+        axes = drawn({0: found}, {1: suggestion("b", (4.0, 5.0, 1.0))})
+        (number,) = axes.texts
+        at, ring = axes.transData.transform([(4, 5), (4, 4)])
+        assert isinstance(axes.figure, Figure)
+        dpi = axes.figure.dpi
+        away = np.linalg.norm(at + np.asarray(number.get_position()) * dpi / 72 - ring) / dpi
+        assert away >= ring_radius(9, 9) + 0.1
 
     def test_states_of_places_are_marked_at_them(self) -> None:
         its = replace(place("a", upright(3, 4), 9, {}), is_outdated=True, adopted_count=2, retired_count=1)

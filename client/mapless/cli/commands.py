@@ -4,6 +4,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from ..results import PlaceState, Reference, Scene, summary_of
 from .adoption import adopted_table, places_table, policy_of, policy_text, retired_table
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import depth_of, limits
-from .output import card, is_confirmed, plain, serving_states, show, table
+from .output import card, is_confirmed, is_json, plain, serving_states, show, table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
 
@@ -98,14 +99,27 @@ def get_scene(client: Client, arguments: argparse.Namespace) -> int:
     """Prints a scene with its datum and calibration."""
     scene = client.get_scene(arguments.scene)
     _warn(scene.warnings)
-    return show(arguments, scene, _scene_card(scene))
+    text = [] if is_json(arguments) else _scene_card(scene, _kinds(client, arguments.scene))
+    return show(arguments, scene, text)
 
 
-def _scene_card(scene: Scene) -> list[str]:
+_MOST_COUNTED = 1000
+
+
+def _kinds(client: Client, scene: str) -> str:
+    """How many references of a scene were adopted or are retired, for a person; empty without any."""
+    found = list[str]()
+    for kind, wanted in (("adopted", {"only_adopted": True}), ("retired", {"only_retired": True})):
+        count = sum(1 for _ in islice(client.list_references(scene, **wanted), _MOST_COUNTED))
+        found += [f"{count}{' or more' if count == _MOST_COUNTED else ''} {kind}"] if count else []
+    return f" ({', '.join(found)})" if found else ""
+
+
+def _scene_card(scene: Scene, kinds: str = "") -> list[str]:
     down, calibration = scene.down_in_world, scene.calibration
     return card(
         scene=scene.scene_id,
-        references=scene.reference_count,
+        references=f"{scene.reference_count}{kinds}",
         unit=_unit(scene),
         datum=f"{_place(scene.datum)}, {scene.datum.height_m:.2f} m" if scene.datum else None,
         down=None if down is None else " ".join(f"{it:.4f}" for it in down),

@@ -27,8 +27,9 @@ _DENSE, _LEAST_PIN = 150, 0.45
 """References from which pins become smaller, and the smallest of them."""
 _WIDTH_IN = 10.0
 _HEIGHTS_IN = (3.0, 11.0)
-_ARROW_PT = 26
-"""Distance on the page from a suggestion's number to its position, points."""
+_ARROWS_PT, _NUMBER_PT = (26, 36, 46, 56, 66), 9
+"""Distances on the page from a suggestion's number to its position, points: the first at which the number, of this
+radius, covers no ring."""
 _MOST_DAYS = 10
 """Days that are named at an axis."""
 LOCALIZED = COLOURS[0]
@@ -98,8 +99,9 @@ def plan_axes(seen: Seen) -> Axes:
         _draw_rings(axes, seen, scale)
         _draw_pins(axes, seen, scale)
         _draw_marks(axes, seen, scale)
+    axes.apply_aspect()  # so that distances on the page are known
     for number, it in seen.suggestions.items():
-        _draw_suggestion(axes, seen.basis, number, it)
+        _draw_suggestion(axes, seen, number, it, scale)
     return axes
 
 
@@ -179,14 +181,31 @@ def _draw_marks(axes: Axes, seen: Seen, scale: float) -> None:
             marks.set(markersize=26 * scale, markerfacecolor="none", markeredgecolor=colour, markeredgewidth=2)
 
 
-def _draw_suggestion(axes: Axes, basis: Array, number: int, it: ReferenceSuggestion) -> None:
+def _behind(axes: Axes, seen: Seen, at: Array, ahead: Array, scale: float) -> Array:
+    """Offset (2,) of a suggestion's number from its position (2,), points: behind it, where it covers no ring."""
+    point = axes.transData.transform(at)
+    figure = axes.figure
+    assert isinstance(figure, Figure)
+    of_points = figure.dpi / 72
+    rings = [
+        ((axes.transData.transform(seen.basis @ it.rejected_at) - point) / of_points, radius)
+        for it in seen.places.values()
+        if it.rejections
+        for radius in (72 * scale * ring_radius(it.rejected_count, seen.most_rejected),)
+    ]
+    offsets = [-length * ahead for length in _ARROWS_PT]
+    clear = (each for each in offsets if all(np.linalg.norm(each - at) >= r + _NUMBER_PT for at, r in rings))
+    return next(clear, offsets[0])
+
+
+def _draw_suggestion(axes: Axes, seen: Seen, number: int, it: ReferenceSuggestion, scale: float) -> None:
     """The number of a suggestion behind its position, with an arrow to there that points the way to look."""
-    at, ahead = basis @ np.asarray(it.position, float), heading_of(basis, it.forward)
+    at, ahead = seen.basis @ np.asarray(it.position, float), heading_of(seen.basis, it.forward)
     disk = {"boxstyle": "circle,pad=0.25", "facecolor": SUGGESTED, "edgecolor": "white", "linewidth": 0.8}
     text = axes.annotate(
         str(number),
         (float(at[0]), float(at[1])),
-        xytext=(0, 0) if ahead is None else tuple((-_ARROW_PT * ahead).tolist()),
+        xytext=(0, 0) if ahead is None else tuple(_behind(axes, seen, at, ahead, scale).tolist()),
         textcoords="offset points",
         arrowprops=None if ahead is None else {"arrowstyle": "-|>", "color": INK, "linewidth": 2.2, "shrinkB": 0},
         annotation_clip=False,
