@@ -282,7 +282,9 @@ class TestScenes:
         *_, last = new_references(REFERENCES)
         radii = mapless.Accuracy(0.01, 0.02, 0.1, 0.2)
         provenance = mapless.Provenance("ADOPTED", radii, 0.5, (mapless.Voucher("r0", 40),))
-        adoption.adopt(store, SCENE, replace(last, provenance=provenance, place_key="place", usefulness=0.2), 4)
+        keys = store.find_keys(SCENE, ["r0"])
+        new = replace(last, provenance=provenance, place_key=keys["r0"], usefulness=0.2)
+        adoption.adopt(store, SCENE, new, keys.values(), 4)
         found = Server(store).run()
         assert found is not None
         assert found.answer_count == surveyed.answer_count < usual.answer_count

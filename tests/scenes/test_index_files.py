@@ -35,7 +35,7 @@ from mapless_server.scenes.retrieval.index_file import BLOCK_ROWS, VERSION, Head
 from mapless_server.scenes.retrieval.lists import ListOptions
 from mapless_server.scenes.retrieval.ranking import Selection, rank_references
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, Store
+from mapless_server.store import NewReference, Store, restoring
 from mapless_server.store.adoption import retire
 from mapless_server.store.portions import IndexedPortion, IndexReader
 from mapless_server.store.records import RetirementReason
@@ -153,7 +153,7 @@ class TestUse:
         made = serve(options=replace(OPTIONS, longest_kept_s=0.0))
         wait_until(lambda: made.entries().changed_counts() == (0, 0))
         assert len(made.filed()) == 59
-        store.restore_reference(SCENE, "r7")
+        restoring.restore_reference(store, SCENE, "r7")
         for it in (indexes, made, serve()):
             assert "r7" in it.entries()
             assert len(it.entries()) == 60

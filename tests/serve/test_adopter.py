@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from support.servers import listening
 
 from mapless import AdoptionPolicy, Client, NewReference, Rejected, RigImage, SequenceFrame
+from mapless_server.errors import DataLoss
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Refusal
 from mapless_server.security import SceneKey
 from mapless_server.serve.adoption import adopter as module
@@ -232,6 +233,50 @@ def test_what_was_adopted_is_deleted_by_its_age(held: Held) -> None:
         held.adopter._now = lambda: datetime.now(timezone.utc)
     assert held.adopted == []
     assert len(list(held.client.list_references("room"))) == 8
+
+
+def test_one_that_cannot_be_deleted_keeps_no_others(held: Held, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in (0, 4):
+        assert held.consider(held.candidate(held.place.queries[number])) is None
+    first, *_ = held.adopted
+    delete = held.store.delete_reference
+
+    def damaged(scene_key: SceneKey, reference_id: str) -> str:
+        if reference_id == first:
+            raise DataLoss("the store is damaged")
+        return delete(scene_key, reference_id)
+
+    monkeypatch.setattr(held.store, "delete_reference", damaged)
+    monkeypatch.setattr(held.adopter, "_now", lambda: datetime.now(timezone.utc) + timedelta(hours=25))
+    for it in held.client.get_reference("room", first).provenance.vouchers:
+        delete(ROOM, it.reference_id)
+    held.maintain()
+    assert held.adopted == [first]
+    assert list(held.store.list_retirements(ROOM, [first])) == [first]  # for its vouchers
+
+
+def test_a_damaged_index_ends_no_other_scenes_places(held: Held, monkeypatch: pytest.MonkeyPatch) -> None:
+    other, place = SceneKey("other"), held.place
+    held.client.create_scene("other")
+    held.client.add_references("other", [it.reference() for it in place.references[::2]])
+    try:
+        for it in (other, ROOM):
+            keys = held.store.find_keys(it, [place.references[0].name])
+            adoption.change_standings(held.store.database, keys.values(), lambda _, known: adoption.outdated(known))
+            held.client.add_references(it, [it.reference() for it in place.references[1::2]])
+        localizer = held.adopter._keeper._localizer
+        again = localizer.surveyed_again
+
+        def surveyed_again(scene_key: SceneKey, *asked: object) -> set[str]:
+            if scene_key == other:
+                raise DataLoss("its index is damaged")
+            return again(scene_key, *asked)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(localizer, "surveyed_again", surveyed_again)
+        held.maintain()
+        assert list(adoption.list_outdated_scenes(held.store.database)) == [other]
+    finally:
+        held.client.delete_scene("other")
 
 
 def test_a_place_with_too_little_survey_left_is_named(held: Held) -> None:

@@ -108,13 +108,13 @@ async def test_vouchers_are_looked_up_after_changes_only(monkeypatch: pytest.Mon
     room, asked = key_of("one", "room"), list[str]()
     generations = {room: 1}
 
-    def looked_up(_: object, scene_key: str) -> dict[str, float]:
+    def looked_up(_: object, scene_key: str) -> list[str]:
         asked.append(scene_key)
-        return {}
+        return []
 
     monkeypatch.setattr(adoption, "list_expired", lambda *_: [])
     monkeypatch.setattr(adoption, "list_adopting_scenes", lambda _: dict(generations))
-    monkeypatch.setattr(adoption, "missing_vouchers", looked_up)
+    monkeypatch.setattr(adoption, "unvouched", looked_up)
     monkeypatch.setattr(adoption, "list_outdated_scenes", lambda _: {})
     stored = cast(Store, SimpleNamespace(database=None))
     its = adopter.Adopter(cast(QueueEngine, None), stored, cast(BackgroundObserver, None), 24.0)

@@ -24,7 +24,7 @@ def test_a_scene_that_ages_has_metrics(tmp_path: Path) -> None:
         known = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("a", 40),))
         for name in ("x", "y"):
             new = replace(make_reference(name), provenance=known, place_key=keys["a"])
-            adoption.adopt(store, HALL, new, 9)
+            adoption.adopt(store, HALL, new, [keys["a"]], 9)
         adoption.retire(store, HALL, [keys["c"]], RetirementReason.CONTRADICTED)
         known_of = {
             keys["a"]: adoption.outdated(Standing(surveyed_share=0.35, photograph_count=20)),

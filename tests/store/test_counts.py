@@ -1,14 +1,19 @@
 """Counts of answered photographs, and what a report reads; on either database."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime, timezone
 
+import pytest
+from sqlalchemy import Connection, func, select
 from support.stores import Place, Shared, make_reference
 
 from mapless import Accuracy, AdoptionPolicy, Provenance, Voucher
 from mapless_server.security import SceneKey
-from mapless_server.store import RetirementReason, SceneAttributes, Store, adoption, counts
+from mapless_server.store import RetirementReason, SceneAttributes, Store, adoption, counts, deletion
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums
+from mapless_server.store.tables import scene_count
 
 HALL = SceneKey("hall")
 MONDAY = 20_000
@@ -65,6 +70,29 @@ def test_counts_of_old_days_are_deleted(place: Place) -> None:
         assert [it.day for it in stored(store)] == [MONDAY + 1]
 
 
+@pytest.mark.parametrize("of", ["days", "scene"])
+def test_no_transaction_deletes_more_than_a_portion(place: Place, monkeypatch: pytest.MonkeyPatch, of: str) -> None:
+    """Others wait for a portion, not for a year of counts."""
+    monkeypatch.setattr(deletion, "COUNTS_AT_A_TIME", 2)
+    with place.open() as store:
+        store.create_scene(HALL)
+        counts.add_counts(store.database, {HALL: {KEY._replace(day=MONDAY + i): ONE for i in range(5)}})
+        write, left = store.database.write, list[int]()
+
+        @contextmanager
+        def counted() -> Iterator[Connection]:
+            with write() as connection:
+                yield connection
+                left.append(connection.scalar(select(func.count()).select_from(scene_count)) or 0)
+
+        monkeypatch.setattr(store.database, "write", counted)
+        if of == "days":
+            assert counts.delete_counts(store.database, MONDAY + 9) == 5
+        else:
+            store.delete_scene(HALL)
+        assert left[:3] == [3, 1, 0]
+
+
 def test_a_report_reads_its_days_alone(place: Place) -> None:
     with place.open() as store:
         store.create_scene(HALL)
@@ -77,12 +105,13 @@ def test_a_report_has_what_was_adopted_and_retired(place: Place) -> None:
     with place.open() as store:
         store.create_scene(HALL, SceneAttributes(adoption=AdoptionPolicy()))
         keys = {it.reference_id: it.key for it in store.add_references(HALL, [make_reference(it) for it in "ab"])}
+        at_b = keys["b"]
         known = Provenance("ADOPTED", Accuracy(0.01, 0.02, 0.1, 0.2), 0.5, (Voucher("b", 40),))
-        new = [
-            adoption.adopt(store, HALL, replace(make_reference(it), provenance=known, place_key="place"), 9)[0]
+        (new, _), _ = [
+            adoption.adopt(store, HALL, replace(make_reference(it), provenance=known, place_key=at_b), [at_b], 9)
             for it in "xy"
         ]
-        adoption.retire(store, HALL, [new[0].key], RetirementReason.VOUCHERS_GONE)
+        adoption.retire(store, HALL, [new.key], RetirementReason.VOUCHERS_GONE)
         adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
         found = counts.read_report(store.database, HALL, today, today + 1, 9)
         assert [(it.reference_id, it.retirement_reason) for it in reversed(found.events)] == [
@@ -91,7 +120,7 @@ def test_a_report_has_what_was_adopted_and_retired(place: Place) -> None:
             ("x", "vouchers_gone"),
             ("a", "contradicted"),
         ]
-        assert found.adopted == {"place": (1, 1), keys["a"]: (0, 1)}
+        assert found.adopted == {at_b: (1, 1), keys["a"]: (0, 1)}
         assert counts.read_report(store.database, HALL, today - 9, today - 1, 9).events == []
         assert counts.find_references(store.database, HALL, [keys["a"], "gone"]).keys() == {keys["a"]}
 

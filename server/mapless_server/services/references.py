@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -69,6 +70,8 @@ if TYPE_CHECKING:  # services do not load what computes
     from mapless_server.scenes import ReferenceAudit
     from mapless_server.scenes.agreement import Agreement
 
+log = logging.getLogger(__name__)
+
 MAX_BATCH = 1000
 MAX_RETRIEVED = 1000
 DEFAULT_AUDITS, MAX_AUDITS = 10, 100
@@ -103,6 +106,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         self._store = store
         self._reach = Reach(store)
         self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
+        self._reporting = asyncio.Lock()  # a report of a large scene takes seconds and much memory
 
     def close(self) -> None:
         """Waits for running operations of the store."""
@@ -317,14 +321,16 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def RestoreReferences(self, request: pb.RestoreReferencesRequest, call: Call) -> pb.RestoreReferencesResponse:
         """Implements ReferenceService.RestoreReferences."""
-        from mapless_server.store import adoption
+        from mapless_server.store import restoring
 
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
         since, place_id = restored_from_message(request, scene_id_of(scene_key))
         if place_id != "" and await self._stored(self._is_adopted, scene_key, place_id):
             raise FieldError("place", f"{names.shown(place_id)} was adopted: name the surveyed reference of its place")
-        restored = await self._stored(adoption.restore, self._store, scene_key, since, place_id)
-        made = [names.reference_name(scene_id_of(scene_key), it) for it in restored]
+        restored = await self._stored(restoring.restore, self._store, scene_key, since, place_id)
+        for reference_id, why in restored.staying.items():
+            log.warning("%s of scene %s stays retired: %s", reference_id, scene_key, why)
+        made = [names.reference_name(scene_id_of(scene_key), it) for it in restored.reference_ids]
         return pb.RestoreReferencesResponse(references=made)
 
     def _is_adopted(self, scene_key: SceneKey, reference_id: str) -> bool:
@@ -335,8 +341,10 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def RestoreReference(self, request: pb.RestoreReferenceRequest, call: Call) -> pb.RestoreReferenceResponse:
         """Implements ReferenceService.RestoreReference."""
-        key, reference_id = await self._reach.reference_key(call, request.name, "name")
-        record = await self._stored(self._store.restore_reference, key, reference_id)
+        from mapless_server.store import restoring
+
+        named = await self._reach.reference_key(call, request.name, "name")
+        record = await self._stored(restoring.restore_reference, self._store, *named)
         return pb.RestoreReferenceResponse(reference=reference_to_message(record))
 
     async def RetrieveReferences(
@@ -385,7 +393,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def GetSceneReport(self, request: pb.GetSceneReportRequest, call: Call) -> pb.GetSceneReportResponse:
         """Implements ReferenceService.GetSceneReport."""
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
-        return pb.GetSceneReportResponse(report=await self._stored(scene_report, self._store, scene_key, request))
+        async with self._reporting:
+            return pb.GetSceneReportResponse(report=await self._stored(scene_report, self._store, scene_key, request))
 
     async def CheckCoverage(self, request: pb.CheckCoverageRequest, call: Call) -> pb.CheckCoverageResponse:
         """Implements ReferenceService.CheckCoverage."""

@@ -17,10 +17,9 @@ from typing import Any
 from sqlalchemy import Connection, Row, Select, select, update
 
 from mapless.provenance import ADOPTED
-from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey
 
-from . import deletion, queries, retiring, rows
+from . import deletion, queries, restoring, retiring, rows
 from .database import Database
 from .records import Adopted, NewReference, ReferenceRecord, RetirementReason, Standing
 from .store import Store
@@ -36,12 +35,14 @@ class PlaceFull(Exception):
 
 
 def adopt(
-    store: Store, scene_key: SceneKey, new: NewReference, most_per_place: int
+    store: Store, scene_key: SceneKey, new: NewReference, voucher_keys: Collection[str], most_per_place: int
 ) -> tuple[ReferenceRecord, frozenset[str]]:
-    """Adds an adopted reference, if the scene still adopts and what vouches for it is still there, in one transaction.
+    """Adds an adopted reference, if the scene still adopts and what it rests on is as it was, in one transaction.
 
-    So many that are not retired are kept at its place, `NewReference.place_key`; the least useful are deleted. Where
-    there is one of the same `NewReference.adopted_by`, retired or not, there is no place for another.
+    That are the surveyed references that vouch for it, by their keys, since another one may have got the id of one; and
+    its place, `NewReference.place_key`, which needs no new survey. So many that are not retired are kept there; the
+    least useful are deleted. Where there is one of the same `NewReference.adopted_by`, retired or not, there is no
+    place for another.
 
     Returns:
         The new reference, and the keys of those that were deleted.
@@ -53,14 +54,28 @@ def adopt(
         raise ValueError(f"the provenance must be {ADOPTED}, is {new.provenance.source}")
     column, adopted, left = reference.c, adopted_reference.c, list[str]()
 
+    def refuse_changed(connection: Connection) -> None:
+        wanted = {it.reference_id for it in new.provenance.vouchers}
+        is_surveyed = ~queries.is_retired(column.key) & column.key.not_in(select(adopted.reference_key))
+        there: Select[Any] = select(column.key, column.reference_id).where(
+            column.scene_id == scene_key, column.key.in_({*voucher_keys, new.place_key}), is_surveyed
+        )
+        found = {it.key: it.reference_id for it in connection.execute(there)}
+        if {found.get(it) for it in voucher_keys} != wanted:
+            raise NotAdopted("a surveyed reference that vouches for it was deleted, retired or replaced")
+        if new.place_key not in found:
+            raise NotAdopted("the surveyed reference of its place was deleted or retired")
+        standing = reference_standing.c
+        outdated = select(standing.outdate_time_us).where(standing.reference_key == new.place_key)
+        # Who declares it outdated waits for the end of the transaction, and then retires this one, too.
+        if connection.scalar(outdated.with_for_update(read=True)) is not None:
+            raise NotAdopted("its place needs a new survey")
+
     def admit(connection: Connection) -> None:
         if rows.scene_attributes(queries.find_scene(connection, scene_key)).adoption is None:
             raise NotAdopted("the scene adopts no photographs any more")
         queries.refuse_taken_ids(connection, scene_key, [new.reference_id])  # before the same one leaves for it
-        wanted = [it.reference_id for it in new.provenance.vouchers]
-        vouching = select(column.key).where(column.scene_id == scene_key, column.reference_id.in_(wanted))
-        if len(connection.scalars(vouching.where(~queries.is_retired(column.key))).all()) < len(wanted):
-            raise NotAdopted("a surveyed reference that vouches for it was deleted or retired")
+        refuse_changed(connection)
         here = (
             select(column.key, adopted.usefulness)
             .join(adopted_reference, adopted.reference_key == column.key)
@@ -135,48 +150,20 @@ CLOCKS_DIFFER_US = 60_000_000
 """Clocks of servers that share a store may differ by so much; one that was set back prolongs nothing."""
 
 
-def missing_vouchers(database: Database, scene_key: SceneKey) -> dict[str, float]:
-    """Share of the vouching matches whose references are gone, by key, of adopted references that are not retired.
-
-    Only those that lack some. A reference that is retired is gone, and one that was stored after the adopted one is
-    another with the same id. Damaged adopted references are left out: they are not used anyway.
-    """
-    column, found = reference.c, dict[str, float]()
-    is_adopted = column.key.in_(select(adopted_reference.c.reference_key))
-    of_scene = (column.scene_id == scene_key) & ~queries.is_retired(column.key)
+def unvouched(database: Database, scene_key: SceneKey) -> list[str]:
+    """Keys of the adopted references that are not retired, and more than half of whose vouching matches are gone."""
+    column = reference.c
+    adopted = select(column.key).join(adopted_reference, adopted_reference.c.reference_key == column.key)
     with database.read() as connection:
-        records = [
-            record
-            for row in connection.execute(select(reference).where(of_scene, is_adopted))
-            if (record := _undamaged(row)) is not None
-        ]
-        named = sorted({it.reference_id for record in records for it in record.provenance.vouchers})
-        surveyed: Select[Any] = select(column.reference_id, column.create_time_us).where(of_scene, ~is_adopted)
-        created = {
-            it.reference_id: rows.time_of(it.create_time_us)
-            for ids in queries.portions(named)
-            for it in connection.execute(surveyed.where(column.reference_id.in_(ids)))
-        }
-    for record in records:
-        vouchers = record.provenance.vouchers
-        there = {it for it in vouchers if (at := created.get(it.reference_id)) and at <= record.create_time}
-        lost = sum(it.match_count for it in vouchers if it not in there)
-        if lost:
-            found[record.key] = lost / sum(it.match_count for it in vouchers)
-    return found
-
-
-def _undamaged(row: Row[Any]) -> ReferenceRecord | None:
-    try:
-        return rows.reference_record(row)
-    except DataLoss:
-        return None
+        keys = connection.scalars(adopted.where(column.scene_id == scene_key, ~queries.is_retired(column.key))).all()
+        lost = restoring.lost_shares(connection, scene_key, keys)
+    return sorted(key for key, share in lost.items() if share > restoring.MOST_LOST_SHARE)
 
 
 def set_usefulness(database: Database, usefulness: Mapping[str, float]) -> None:
     """Stores the usefulness of adopted references, by key; those that are gone are passed over."""
     with database.write() as connection:
-        for key, value in usefulness.items():
+        for key, value in sorted(usefulness.items()):  # in one order, or two servers would wait for each other
             row = update(adopted_reference).where(adopted_reference.c.reference_key == key)
             connection.execute(row.values(usefulness=value))
 
@@ -248,18 +235,28 @@ def change_standings(
     References that are gone are passed over. Servers that count at once lose nothing: the rows are locked.
     """
     made = dict[str, Standing]()
-    column = reference_standing.c
     with database.write() as connection:
         for key in sorted(keys):
-            if connection.scalar(select(reference.c.key).where(reference.c.key == key)) is None:
+            there = select(reference.c.key).where(reference.c.key == key)
+            # Its deletion waits for the end of the transaction.
+            if connection.scalar(there.with_for_update(read=True, key_share=True)) is None:
                 continue
-            queries.insert_new(connection, reference_standing, {"reference_key": key})
-            row = connection.execute(select(reference_standing).where(column.reference_key == key).with_for_update())
-            made[key] = change(key, rows.standing(row.one()))
+            made[key] = change(key, rows.standing(_locked_standing(connection, key)))
             values = dict(vars(made[key]))
             values |= {name: " ".join(values[name]) for name in ("contradicted_by", "surveyed_by")}
-            connection.execute(update(reference_standing).where(column.reference_key == key).values(values))
+            row = update(reference_standing).where(reference_standing.c.reference_key == key)
+            connection.execute(row.values(values))
     return made
+
+
+def _locked_standing(connection: Connection, key: str) -> Row[Any]:
+    """The row of what is known of a reference, which is inserted if there is none."""
+    stored: Select[Any] = select(reference_standing).where(reference_standing.c.reference_key == key).with_for_update()
+    while True:
+        queries.insert_new(connection, reference_standing, {"reference_key": key})
+        row = connection.execute(stored).one_or_none()
+        if row is not None:  # else it was restored by another server after the insertion
+            return row
 
 
 def outdated(standing: Standing) -> Standing:
@@ -297,27 +294,3 @@ def retire_by_operator(store: Store, scene_key: SceneKey, reference_id: str) -> 
         if not retiring.retired_among(connection, [key]):
             retiring.retire(connection, scene_key, generation, [key], RetirementReason.BY_OPERATOR)
     return store.get_reference(scene_key, reference_id)
-
-
-def restore(store: Store, scene_key: SceneKey, since: datetime | None = None, place_id: str = "") -> list[str]:
-    """Has retired references of a scene chosen again, as one change; returns their ids, ordered.
-
-    Those that were retired at a time or later, and of the place of the surveyed reference with this id: itself, and
-    what was adopted there. NotFound if there is no such scene or reference.
-    """
-    column, standing = reference.c, reference_standing.c
-    retired = (
-        select(column.key, column.reference_id)
-        .join(reference_standing, standing.reference_key == column.key)
-        .where(column.scene_id == scene_key, standing.retire_time_us >= (0 if since is None else rows.time_us(since)))
-        .order_by(column.reference_id)
-    )
-    with store.changing() as connection:
-        generation = queries.begin_change(connection, scene_key)
-        if place_id:
-            place_key = queries.find_key(connection, scene_key, place_id, "place")
-            here = select(adopted_reference.c.reference_key).where(adopted_reference.c.place_key == place_key)
-            retired = retired.where((column.key == place_key) | column.key.in_(here))
-        found = connection.execute(retired).all()
-        retiring.restore(connection, scene_key, generation, [it.key for it in found])
-    return [it.reference_id for it in found]

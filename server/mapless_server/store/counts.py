@@ -11,13 +11,14 @@ from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-from sqlalchemy import Select, case, delete, func, select, true
+from sqlalchemy import Select, case, func, select, true
 
 from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey
 
 from . import queries, rows
 from .database import Database
+from .deletion import delete_counts_where
 from .records import ReferenceRecord
 from .tables import adopted_reference, reference, reference_standing, scene, scene_count
 
@@ -106,9 +107,8 @@ def add_counts(database: Database, counted: Mapping[SceneKey, Mapping[CountKey, 
 
 
 def delete_counts(database: Database, before_day: int) -> int:
-    """Deletes the counts of days before one; returns the number of rows."""
-    with database.write() as connection:
-        return connection.execute(delete(scene_count).where(scene_count.c.day < before_day)).rowcount
+    """Deletes the counts of days before one, in portions; returns the number of rows."""
+    return delete_counts_where(database, scene_count.c.day < before_day)
 
 
 class Event(NamedTuple):

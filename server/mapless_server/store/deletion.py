@@ -6,19 +6,43 @@ that are left are deleted when the store is opened again, or with the next scene
 
 import logging
 import threading
+import time
 import uuid
 from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import accumulate
 
-from sqlalchemy import Column, Connection, ScalarSelect, delete, func, insert, literal, select, update
+from sqlalchemy import (
+    Column,
+    ColumnElement,
+    Connection,
+    ScalarSelect,
+    delete,
+    func,
+    insert,
+    literal,
+    select,
+    tuple_,
+    update,
+)
 
 from mapless_server.errors import Overloaded
 from mapless_server.security import SceneKey
 
 from .database import DamagedPages, Database, with_room_to_delete
 from .queries import DETACHED, is_detached
-from .tables import depth, features, global_descriptor, image, mask, reference, reference_depth, reference_pair, scene
+from .tables import (
+    depth,
+    features,
+    global_descriptor,
+    image,
+    mask,
+    reference,
+    reference_depth,
+    reference_pair,
+    scene,
+    scene_count,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -30,6 +54,8 @@ over. This is as much as it collects there anyway: the journal stays small, and 
 """
 REFERENCES_AT_A_TIME = 100
 """Most references per transaction; other writers of SQLite wait as long."""
+COUNTS_AT_A_TIME = 5000
+"""Most rows of `scene_count` per transaction: other writers wait for about as long."""
 PAUSE_S = 0.01
 """Between transactions, so that other writers get SQLite's lock, which is given in no order."""
 
@@ -141,6 +167,19 @@ class PendingDeletions:
 
 def _log_failure(error: Exception) -> None:
     logger.warning("what is left of deleted scenes stays until the next start or deletion of a scene: %s", error)
+
+
+def delete_counts_where(database: Database, are_wanted: ColumnElement[bool]) -> int:
+    """Deletes rows of `scene_count`, in portions; returns their number."""
+    key, total = tuple_(*scene_count.primary_key), 0
+    portion = select(*scene_count.primary_key).where(are_wanted).limit(COUNTS_AT_A_TIME)
+    while True:
+        with database.write() as connection:
+            count = connection.execute(delete(scene_count).where(key.in_(portion))).rowcount
+        total += count
+        if count < COUNTS_AT_A_TIME:
+            return total
+        time.sleep(PAUSE_S)
 
 
 # The statements; each runs in the caller's transaction.

@@ -1,14 +1,14 @@
-"""Retires references of a scene and restores them, within a change of the scene."""
+"""Retires references of a scene, within a change of the scene."""
 
 from collections.abc import Sequence
 
-from sqlalchemy import Connection, delete, select, update
+from sqlalchemy import Connection, select, update
 
 from mapless_server.security import SceneKey
 
 from . import queries, rows
 from .records import RetirementReason
-from .tables import reference, reference_standing, removed_reference, scene
+from .tables import reference, reference_standing
 
 
 def retire(
@@ -31,16 +31,3 @@ def retired_among(connection: Connection, keys: Sequence[str]) -> list[str]:
         for some in queries.portions(sorted(keys))
     ]
     return sorted(key for some in found for key in some)
-
-
-def restore(connection: Connection, scene_key: SceneKey, generation: int, keys: Sequence[str]) -> None:
-    """Has retired references of a scene chosen again, and forgets what was held against them."""
-    if not keys:
-        return
-    for some in queries.portions(list(keys)):
-        connection.execute(delete(reference_standing).where(reference_standing.c.reference_key.in_(some)))
-        again = update(reference).where(reference.c.key.in_(some))  # for work in the background
-        connection.execute(again.values(generation=generation))
-    # Indexes never add a key again that they removed; so all of them read the whole scene.
-    connection.execute(delete(removed_reference).where(removed_reference.c.scene_id == scene_key))
-    connection.execute(update(scene).where(scene.c.scene_id == scene_key).values(first_generation=generation))

@@ -22,7 +22,7 @@ from mapless_server.errors import AlreadyExists, DataLoss, NotFound, Overloaded
 from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, SceneLimit, scene_id_of
 
-from . import deletion, queries, retiring, rows, tables
+from . import deletion, queries, rows, tables
 from .database import DamagedPages, Database, with_room_to_delete
 from .deletion import PendingDeletions
 from .depth_images import encode_depth_image
@@ -249,6 +249,8 @@ class Store(StoreReader):
         return frozenset(key for key, _ in gone)
 
     def _detach_scene(self, scene_key: SceneKey) -> None:
+        # To detach so many would take as long as to delete them.
+        deletion.delete_counts_where(self.database, tables.scene_count.c.scene_id == scene_key)
         with self.changing() as connection:
             queries.begin_change(connection, scene_key)
             self.database.lift_limits(connection)
@@ -375,23 +377,10 @@ class Store(StoreReader):
         return {it.reference_id: why for it in found if (why := rows.retirement(it)) is not None}
 
     @observed
-    def restore_reference(self, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
-        """Has a retired reference chosen again, and forgets what was held against it; others are left as they are.
-
-        NotFound if there is no such scene or reference.
-        """
-        with self.changing() as connection:
-            generation = queries.begin_change(connection, scene_key)
-            key = queries.find_key(connection, scene_key, reference_id)
-            retiring.restore(connection, scene_key, generation, retiring.retired_among(connection, [key]))
-        return self.get_reference(scene_key, reference_id)
-
-    @observed
     def try_writing(self) -> None:
         """Writes without changing anything; raises as every change does if the store cannot be written."""
-        version = tables.store_version
         with self.changing() as connection:
-            connection.execute(update(version).values(schema_version=version.c.schema_version))
+            connection.execute(update(it := tables.store_version).values(schema_version=it.c.schema_version))
 
 
 def _now() -> datetime:

@@ -10,7 +10,7 @@ import asyncio
 import hashlib
 import logging
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from datetime import datetime, timezone
 
 from mapless.answers import Accuracy
@@ -20,7 +20,7 @@ from mapless.scenes import AdoptionPolicy
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.query import Photo, Query, Result
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.errors import AlreadyExists, RequestError
+from mapless_server.errors import AlreadyExists
 from mapless_server.method.judge.answer import Localization
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
@@ -29,7 +29,7 @@ from mapless_server.security import Principal, SceneKey
 from mapless_server.store import NewReference, Store, adoption, time_us
 
 from .evidence import distance_shown, inliers_px, kept_query, keypoints_px, rival_count
-from .keeping import Keeper
+from .keeping import Keeper, guarded
 from .surveyed import Place, SurveyedLocalizer
 from .waiting import Candidate, Waiting
 
@@ -105,7 +105,7 @@ class Adopter:
                 await self._waiting.arrived(MAINTAINED_S)
                 await self._until_idle()
                 if (candidate := self.take()) is not None:
-                    await self._guarded(self.consider(candidate), "a photograph could not be considered as a reference")
+                    await guarded(self.consider(candidate), "a photograph is not considered", self._observer)
 
     def take(self) -> Candidate | None:
         """Removes and returns the photograph that was offered first; None if none waits."""
@@ -114,18 +114,8 @@ class Adopter:
     async def _maintain_always(self) -> None:
         while True:
             self._observer.count("adoptions", self._waiting.drop_old(), "queue")
-            await self._guarded(self.maintain(), "adopted references could not be looked after")
+            await self.maintain()
             await asyncio.sleep(MAINTAINED_S)
-
-    async def _guarded(self, work: Awaitable[object], fault: str) -> None:
-        try:
-            await work
-        except RequestError as error:  # the scene is gone, the store is away, the server ends
-            self._observer.count("adoptions", 1, "failed")
-            log.warning("%s: %s", fault, error)
-        except Exception as error:
-            self._observer.count("adoptions", 1, "failed")
-            log.error("%s", fault, exc_info=error)
 
     async def _until_idle(self) -> None:
         queue, since_s = self._engine.queue, time.monotonic()
@@ -136,7 +126,10 @@ class Adopter:
                 busy_s, since_s = queue.busy_s, time.monotonic()
 
     async def maintain(self) -> None:
-        """Deletes adopted references that are too old, and retires those whose vouching references are gone."""
+        """Deletes adopted references that are too old, and retires those whose vouching references are gone.
+
+        Each failure is logged and counted.
+        """
         await self._keeper.maintain(self._now(), self._options or AdoptionOptions())
 
     async def consider(self, candidate: Candidate) -> Refusal | None:
@@ -208,6 +201,7 @@ class Adopter:
         radii = surveyed.position_68_m, surveyed.position_95_m, surveyed.rotation_68_deg, surveyed.rotation_95_deg
         share = rules.surveyed_share(candidate.answered, surveyed)
         vouching = tuple(Voucher(name, count) for name, count in vouchers)
+        voucher_keys = [place.key_of[name] for name, _ in vouchers]
         new = NewReference(
             adopted_id(photo.image),
             photo.image,
@@ -222,7 +216,9 @@ class Adopter:
             adopted_by=rules.adopter_of(candidate.holder, time_us(self._now())),
         )
         try:
-            record, left = await asyncio.to_thread(adoption.adopt, self._store, scene_key, new, policy.most_per_place)
+            record, left = await asyncio.to_thread(
+                adoption.adopt, self._store, scene_key, new, voucher_keys, policy.most_per_place
+            )
         except adoption.PlaceFull:
             return rules.Refusal.PLACE_FULL
         except (adoption.NotAdopted, AlreadyExists) as error:  # by the operator, or another server

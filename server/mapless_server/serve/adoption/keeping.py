@@ -2,14 +2,14 @@
 
 import asyncio
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 
 from mapless.scenes import AdoptionPolicy
 from mapless_server.engine.query import Result
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.errors import NotFound
+from mapless_server.errors import NotFound, RequestError
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
 from mapless_server.scenes.observer import BackgroundObserver
@@ -22,8 +22,19 @@ from .waiting import Candidate
 
 log = logging.getLogger(__name__)
 
-MOST_LOST_SHARE = 0.5
-"""Share of the vouching matches of an adopted reference whose references may be gone."""
+
+async def guarded(work: Awaitable[object], fault: str, observer: BackgroundObserver) -> bool:
+    """Awaits work, of which a failure is logged as this fault, counted, and ends nothing else; whether it succeeded."""
+    try:
+        await work
+    except RequestError as error:  # the scene is gone, the store is away or damaged, the server ends
+        log.warning("%s: %s", fault, error)
+    except Exception as error:
+        log.error("%s", fault, exc_info=error)
+    else:
+        return True
+    observer.count("adoptions", 1, "failed")
+    return False
 
 
 class Keeper:
@@ -49,22 +60,42 @@ class Keeper:
     async def maintain(self, now: datetime, options: AdoptionOptions) -> None:
         """Deletes adopted references that are too old, and retires those whose vouching references are gone.
 
-        Places that were surveyed again are not outdated any more.
+        Places that were surveyed again are not outdated any more. What fails for a reference or a scene is logged and
+        counted, and ends nothing.
         """
         before = now - timedelta(hours=self._hours)
+        await self._guarded(self._delete_expired(before), "adopted references are not looked up by their age")
+        await self._guarded(self._retire_unvouched(), "adopted references are not looked up by scene")
+        await self._guarded(self._end_all_outdated(options), "places that need a new survey are not looked up")
+
+    def _guarded(self, work: Awaitable[object], fault: str) -> Awaitable[bool]:
+        return guarded(work, fault, self._observer)
+
+    async def _delete_expired(self, before: datetime) -> None:
         for scene_key, reference_id in await asyncio.to_thread(adoption.list_expired, self._store.database, before):
-            await asyncio.to_thread(self._delete, scene_key, reference_id)
-            self._observer.count("adopted_expired")
+            deletion = asyncio.to_thread(self._delete, scene_key, reference_id)
+            if await self._guarded(deletion, f"{reference_id} of scene {scene_key}, which is too old, is not deleted"):
+                self._observer.count("adopted_expired")
+
+    async def _retire_unvouched(self) -> None:
         scenes = await asyncio.to_thread(adoption.list_adopting_scenes, self._store.database)
         for scene_key, generation in scenes.items():
-            if self._checked.get(scene_key) != generation:
-                lost = await asyncio.to_thread(adoption.missing_vouchers, self._store.database, scene_key)
-                gone = [key for key, share in lost.items() if share > MOST_LOST_SHARE]
-                await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
-        self._checked = scenes
+            if self._checked.get(scene_key) == generation:
+                continue
+            fault = f"what vouches for adopted references of scene {scene_key} is not looked up"
+            if await self._guarded(self._retire_unvouched_of(scene_key), fault):
+                self._checked[scene_key] = generation
+        self._checked = {it: generation for it, generation in self._checked.items() if it in scenes}
+
+    async def _retire_unvouched_of(self, scene_key: SceneKey) -> None:
+        gone = await asyncio.to_thread(adoption.unvouched, self._store.database, scene_key)
+        await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
+
+    async def _end_all_outdated(self, options: AdoptionOptions) -> None:
         outdated_in = await asyncio.to_thread(adoption.list_outdated_scenes, self._store.database)
         for scene_key, outdated in outdated_in.items():
-            await asyncio.to_thread(self._end_outdated, scene_key, outdated, options)
+            ending = asyncio.to_thread(self._end_outdated, scene_key, outdated, options)
+            await self._guarded(ending, f"places of scene {scene_key} are not compared with its new references")
 
     def _end_outdated(self, scene_key: SceneKey, since_us: Mapping[str, int], options: AdoptionOptions) -> None:
         """Ends what is said of outdated places, given since when, where surveyed references were added later."""

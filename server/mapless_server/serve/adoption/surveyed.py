@@ -58,6 +58,11 @@ class Place:
         return self.surveyed_ids[self.around[0]]
 
     @property
+    def key_of(self) -> dict[str, str]:
+        """Keys of all the surveyed references, by id."""
+        return dict(zip(self.surveyed_ids, self.surveyed_keys, strict=True))
+
+    @property
     def id_of(self) -> dict[str, str]:
         """Ids of the references around, by key."""
         return {self.surveyed_keys[i]: self.surveyed_ids[i] for i in self.around}

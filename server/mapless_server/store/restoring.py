@@ -1,0 +1,176 @@
+"""Has retired references of a scene chosen again, and forgets what was held against them.
+
+Adopted ones that would be retired or deleted again stay retired: those without what vouches for them, those at places
+that need a new survey, and the least useful ones that their places have no room for.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import Connection, Row, Select, delete, func, select, update
+
+from mapless_server.errors import DataLoss, FailedPrecondition
+from mapless_server.security import SceneKey
+
+from . import queries, retiring, rows
+from .records import ReferenceRecord
+from .store import Store
+from .tables import adopted_reference, reference, reference_standing, removed_reference, scene
+
+MOST_LOST_SHARE = 0.5
+"""Share of the vouching matches of an adopted reference whose references may be gone."""
+
+
+@dataclass(frozen=True)
+class Restored:
+    """What became of retired references.
+
+    Attributes:
+        reference_ids: of those that are chosen again, ordered.
+        staying: why others stay retired, by id.
+    """
+
+    reference_ids: Sequence[str]
+    staying: Mapping[str, str]
+
+
+def restore(store: Store, scene_key: SceneKey, since: datetime | None = None, place_id: str = "") -> Restored:
+    """Has retired references of a scene chosen again, as one change, but those that would not last, see the module.
+
+    Those that were retired at a time or later, and of the place of the surveyed reference with this id: itself, and
+    what was adopted there. That place needs no new survey any more; without time and place none of the scene does.
+    NotFound if there is no such scene or reference.
+    """
+    column, standing = reference.c, reference_standing.c
+    retired = (
+        select(column.key, column.reference_id)
+        .join(reference_standing, standing.reference_key == column.key)
+        .where(column.scene_id == scene_key, standing.retire_time_us >= (0 if since is None else rows.time_us(since)))
+        .order_by(column.reference_id)
+    )
+    is_current = column.scene_id == scene_key
+    with store.changing() as connection:
+        generation = queries.begin_change(connection, scene_key)
+        if place_id:
+            place_key = queries.find_key(connection, scene_key, place_id, "place")
+            here = select(adopted_reference.c.reference_key).where(adopted_reference.c.place_key == place_key)
+            retired = retired.where((column.key == place_key) | column.key.in_(here))
+            is_current &= column.key == place_key
+        if place_id or since is None:
+            ended = standing.reference_key.in_(select(column.key).where(is_current))
+            values = {"surveyed_share": None, "photograph_count": 0, "surveyed_by": "", "outdate_time_us": None}
+            is_outdated = standing.outdate_time_us.is_not(None)
+            connection.execute(update(reference_standing).where(ended, is_outdated).values(values))
+        found = {it.key: it.reference_id for it in connection.execute(retired)}
+        staying = _restore_lasting(connection, scene_key, generation, list(found))
+    restored = [it for key, it in found.items() if key not in staying]
+    return Restored(restored, {it: staying[key] for key, it in found.items() if key in staying})
+
+
+def restore_reference(store: Store, scene_key: SceneKey, reference_id: str) -> ReferenceRecord:
+    """Has a retired reference chosen again, and forgets what was held against it; others are left as they are.
+
+    NotFound if there is no such scene or reference; FailedPrecondition if it stays retired, and why.
+    """
+    with store.changing() as connection:
+        generation = queries.begin_change(connection, scene_key)
+        key = queries.find_key(connection, scene_key, reference_id)
+        staying = _restore_lasting(connection, scene_key, generation, retiring.retired_among(connection, [key]))
+        if key in staying:
+            raise FailedPrecondition(f"{reference_id} stays retired: {staying[key]}")
+    return store.get_reference(scene_key, reference_id)
+
+
+def _restore_lasting(
+    connection: Connection, scene_key: SceneKey, generation: int, keys: Sequence[str]
+) -> dict[str, str]:
+    """Has retired references chosen again, but those that would not last; returns why these stay retired, by key."""
+    adopted = adopted_reference.c
+    its = [
+        row
+        for some in queries.portions(sorted(keys))
+        for row in connection.execute(select(adopted_reference).where(adopted.reference_key.in_(some)))
+    ]
+    _restore(connection, scene_key, generation, sorted({*keys} - {it.reference_key for it in its}))
+    lost = lost_shares(connection, scene_key, [it.reference_key for it in its])
+    standing = reference_standing.c
+    is_here = reference.c.scene_id == scene_key
+    outdated = set(
+        connection.scalars(
+            select(reference.c.key)
+            .join(reference_standing, standing.reference_key == reference.c.key)
+            .where(is_here, standing.outdate_time_us.is_not(None))
+        )
+    )
+    used: Select[Any] = (
+        select(adopted.place_key, func.count())
+        .join(reference, adopted.reference_key == reference.c.key)
+        .where(is_here, ~queries.is_retired(reference.c.key))
+        .group_by(adopted.place_key)
+    )
+    counts = Counter({it.place_key: int(it[1]) for it in connection.execute(used)})
+    policy, staying = rows.scene_attributes(queries.find_scene(connection, scene_key)).adoption, dict[str, str]()
+    for it in sorted(its, key=lambda row: (-row.usefulness, -row.adopt_time_us, row.reference_key)):
+        if lost.get(it.reference_key, 0.0) > MOST_LOST_SHARE:
+            staying[it.reference_key] = "what vouches for it was deleted or is retired"
+        elif it.place_key in outdated:
+            staying[it.reference_key] = "its place needs a new survey"
+        elif policy is not None and counts[it.place_key] >= policy.most_per_place:
+            staying[it.reference_key] = f"its place has {policy.most_per_place} adopted references, as many as it may"
+        else:
+            counts[it.place_key] += 1
+    _restore(connection, scene_key, generation, sorted({it.reference_key for it in its} - staying.keys()))
+    return staying
+
+
+def lost_shares(connection: Connection, scene_key: SceneKey, keys: Sequence[str]) -> dict[str, float]:
+    """Share of the vouching matches whose references are gone, by key, of adopted references that lack some.
+
+    A reference that is retired is gone, and one that was stored after the adopted one is another with the same id.
+    Damaged adopted references are left out: they are not used anyway.
+    """
+    column, found = reference.c, dict[str, float]()
+    records = [
+        record for row in queries.rows_by_key(connection, keys).values() if (record := _undamaged(row)) is not None
+    ]
+    named = sorted({it.reference_id for record in records for it in record.provenance.vouchers})
+    is_surveyed = column.key.not_in(select(adopted_reference.c.reference_key)) & ~queries.is_retired(column.key)
+    surveyed: Select[Any] = select(column.reference_id, column.create_time_us).where(
+        column.scene_id == scene_key, is_surveyed
+    )
+    created = {
+        it.reference_id: rows.time_of(it.create_time_us)
+        for ids in queries.portions(named)
+        for it in connection.execute(surveyed.where(column.reference_id.in_(ids)))
+    }
+    for record in records:
+        vouchers = record.provenance.vouchers
+        there = {it for it in vouchers if (at := created.get(it.reference_id)) and at <= record.create_time}
+        lost = sum(it.match_count for it in vouchers if it not in there)
+        if lost:
+            found[record.key] = lost / sum(it.match_count for it in vouchers)
+    return found
+
+
+def _undamaged(row: Row[Any]) -> ReferenceRecord | None:
+    try:
+        return rows.reference_record(row)
+    except DataLoss:
+        return None
+
+
+def _restore(connection: Connection, scene_key: SceneKey, generation: int, keys: Sequence[str]) -> None:
+    if not keys:
+        return
+    for some in queries.portions(keys):
+        connection.execute(delete(reference_standing).where(reference_standing.c.reference_key.in_(some)))
+        again = update(reference).where(reference.c.key.in_(some))  # for work in the background
+        connection.execute(again.values(generation=generation))
+    # Indexes never add a key again that they removed; so all of them read the whole scene.
+    connection.execute(delete(removed_reference).where(removed_reference.c.scene_id == scene_key))
+    connection.execute(update(scene).where(scene.c.scene_id == scene_key).values(first_generation=generation))
