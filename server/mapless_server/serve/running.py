@@ -258,31 +258,48 @@ async def _start(
         _run_task(stack, keep_fresh(protection.refreshes))
     _run_task(stack, watch_store(store, services.set_changeable))
     if port := _port_of(listener.address):
-
-        def connections() -> int:
-            return open_connections(port)
-
+        connections = partial(open_connections, port)
         metrics.scraped.connections, metrics.scraped.most_connections = connections, most_connections
         _run_task(stack, watch_connections(connections))
-
-    async def stop_serving() -> None:
-        await asyncio.wait({failed})
-        await services.set_serving(False)
-
-    _run_task(stack, stop_serving())
+    _run_task(stack, _stop_serving_after(failed, services))
     services.starts("it localizes its first photograph")
     await _warm_up(settings, engine, metrics)
-    from .counting import Counting  # what it imports is loaded by now
+    await _open(stack, settings, services, engine, store, metrics, adopting)
+    _work_when_idle(stack, settings, engine)
+    stack.push_async_callback(listener.stop)
+    stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)
+    return Running(listener.address, metrics_address, engine, failed)
+
+
+async def _stop_serving_after(failed: asyncio.Future[Fatal], services: Services) -> None:
+    await asyncio.wait({failed})
+    await services.set_serving(False)
+
+
+async def _open(
+    stack: AsyncExitStack,
+    settings: Settings,
+    services: Services,
+    engine: QueueEngine,
+    store: Store,
+    metrics: Metrics,
+    adopting: MakeAdopter,
+) -> None:
+    """Answers all calls from now on, with what counts and adopts their photographs."""
+    from .aging import watch_scenes  # what they import is loaded by now
+    from .counting import Counting
 
     counting = Counting(engine, store, metrics, settings.report_days)
     adopter = adopting(engine, store, counting, settings.capture_hours)
     stack.push_async_callback(counting.close)
     _run_task(stack, counting.run())
-    from .aging import watch_scenes
-
     _run_task(stack, watch_scenes(store, settings.metrics_scenes, metrics.scraped))
     await services.open(engine, adopter.offer, counting.note)
     _run_task(stack, adopter.run())
+
+
+def _work_when_idle(stack: AsyncExitStack, settings: Settings, engine: QueueEngine) -> None:
+    """Releases memory, loads stronger features and matches references while nothing is asked."""
     from .idle import release_when_idle  # what it imports is loaded by now
 
     _run_task(stack, release_when_idle(engine.tiers, QUIET_S))
@@ -293,9 +310,6 @@ async def _start(
     if engine.background is not None:
         engine.background.start(settings.background_matching)
         stack.push_async_callback(asyncio.to_thread, engine.background.close)
-    stack.push_async_callback(listener.stop)
-    stack.push_async_callback(services.drain, settings.drain_delay_s, settings.drain_grace_s)
-    return Running(listener.address, metrics_address, engine, failed)
 
 
 def _port_of(address: str) -> int:

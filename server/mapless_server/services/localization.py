@@ -138,21 +138,6 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         recorded: list[list[StageRecord]] = []
         views = None if asked.beyond is None else engine.views_of(query)
 
-        def to_message(result: Result) -> pb.LocalizeResponse:
-            response = outcome_to_message(result, query.options, frames, query.photo)
-            for echoed in ("capture_time", "session_from_camera"):
-                if request.HasField(echoed):
-                    getattr(response, echoed).CopyFrom(getattr(request, echoed))
-            response.diagnostics.CopyFrom(diagnostics_to_message(result, query))
-            response.diagnostics.request_id = call.request_id
-            response.diagnostics.queue_duration.FromNanoseconds(
-                round(1e9 * sum(it.waited_s for records in recorded for it in records))
-            )
-            response.diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
-            processor_s = sum(it.processor_s for records in recorded for it in records)
-            response.diagnostics.processor_duration.FromNanoseconds(round(1e9 * processor_s))
-            return response
-
         def give_better(result: Result) -> None:
             nonlocal given_count
             if give is None:
@@ -162,7 +147,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
                 call.note(first_ms=round(1000 * seconds, 1))
                 self._metrics.answered_early(seconds)
             given_count += 1
-            give(to_message(result))
+            give(response_of(request, query, result, frames, call, recorded))
 
         async def run(query: Query) -> Result:
             job = engine.query_job(query, call.caller, views=views, on_better=None if give is None else give_better)
@@ -177,7 +162,15 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             give = views = None  # a thread that has not noticed the end may still have a better one
             for records in recorded:
                 call.record(records)
-        response, answer = to_message(result), result.answer
+        response = response_of(request, query, result, frames, call, recorded)
+        await self._finish(request, response, query, result, call)
+        return response
+
+    async def _finish(
+        self, request: pb.LocalizeRequest, response: pb.LocalizeResponse, query: Query, result: Result, call: Call
+    ) -> None:
+        """Completes a final answer, reports it, and gives it to those who keep or watch answers."""
+        answer = result.answer
         self._count_attempts([result])
         parts_ms = {stage: round(1000 * seconds, 1) for stage, seconds in result.stage_seconds.items()}
         call.note(parts_ms=parts_ms, used_references=len(result.references))
@@ -198,7 +191,6 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         if not request.options.confidential:
             self._watchers.publish(result.scene_key, request, response, debug)
         self._count_photographs(request, [(query, result)], answer.outcome, response.localization)
-        return response
 
     async def _name_outdated(self, response: Any, results: Sequence[Result]) -> None:
         """Says in rejections which place needs a new survey."""
@@ -387,6 +379,28 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
     ) -> None:
         if self._recorder is not None and not request.options.confidential:
             self._recorder.record(request, response, call, parts, self._engine().tiers, prior_attributes)
+
+
+def response_of(
+    request: pb.LocalizeRequest,
+    query: Query,
+    result: Result,
+    frames: AnswerFrames,
+    call: Call,
+    recorded: Sequence[Sequence[StageRecord]],
+) -> pb.LocalizeResponse:
+    """The message of an answer, with the times until now; `recorded` are the records of the call's jobs."""
+    response = outcome_to_message(result, query.options, frames, query.photo)
+    for echoed in ("capture_time", "session_from_camera"):
+        if request.HasField(echoed):
+            getattr(response, echoed).CopyFrom(getattr(request, echoed))
+    diagnostics, records = response.diagnostics, [it for its in recorded for it in its]
+    diagnostics.CopyFrom(diagnostics_to_message(result, query))
+    diagnostics.request_id = call.request_id
+    diagnostics.queue_duration.FromNanoseconds(round(1e9 * sum(it.waited_s for it in records)))
+    diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
+    diagnostics.processor_duration.FromNanoseconds(round(1e9 * sum(it.processor_s for it in records)))
+    return response
 
 
 async def better_then_final(

@@ -169,13 +169,7 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int, with_prio
     equations = seen.equations(replace(there, residual=residual), problem.loss_scale_sigma, weight=weight)
     data, gradient, points = equations.reduced(LEAST_DAMPING)
     query, posed = problem.query_rows, slice(problem.query_rows.stop)
-    prior, prior_gradient = np.zeros_like(data), np.zeros_like(gradient)
-    held = slice(query.start)
-    prior[held, held] = problem.information / thinning
-    prior_gradient[held] = prior[held, held] @ problem.reference_motion(bundle).ravel()
-    if with_priors:
-        gradient_of_priors, information = problem.of_priors(bundle.world_from_query)
-        prior[query, query], prior_gradient[query] = information / thinning, gradient_of_priors / thinning
+    prior, prior_gradient = _of_prior(problem, bundle, len(data), thinning, with_priors)
     to_pose = _rows_of_pose((data + prior)[posed, posed])
     if to_pose is None:
         return None
@@ -214,8 +208,22 @@ def disperse(problem: BundleProblem, bundle: Bundle, max_matches: int, with_prio
         _gap(seen, bundle),
         intrinsics,
         _by_depths(seen, to_pose, points),
-        to_pose[:, held] @ prior[held, held],
+        to_pose[:, : query.start] @ prior[: query.start, : query.start],
     )
+
+
+def _of_prior(
+    problem: BundleProblem, bundle: Bundle, size: int, thinning: int, with_priors: bool
+) -> tuple[Array, Array]:
+    """Matrix (U, U) and gradient (U,) of what is known of the references' poses, and of the query's `with_priors`."""
+    query, held = problem.query_rows, slice(problem.query_rows.start)
+    prior, gradient = np.zeros((size, size)), np.zeros(size)
+    prior[held, held] = problem.information / thinning
+    gradient[held] = prior[held, held] @ problem.reference_motion(bundle).ravel()
+    if with_priors:
+        of_priors, information = problem.of_priors(bundle.world_from_query)
+        prior[query, query], gradient[query] = information / thinning, of_priors / thinning
+    return prior, gradient
 
 
 def dispersed_covariance(
