@@ -81,7 +81,7 @@ class PlaceState:
 
     Attributes:
         surveyed_share: share of their matches that surveyed references supported, 0 to 1, a running mean.
-        photograph_count: photographs of the place, which is nearer to this reference than to any other.
+        photograph_count: photographs of the place, see `PlaceReport`.
         contradiction_count: photographs in a row that should show what this reference shows, and do not.
     """
 

@@ -23,10 +23,10 @@ class PeriodCounts:
         localized_count: photographs that were localized.
         rejections: number of rejected photographs by the reason's name ("LOW_OVERLAP"), those with most first.
         surveyed_share: share of the matches of localized photographs that surveyed references have, 0 to 1, the mean
-            over these photographs; None without any.
+            over those that have a pose of their own, also without the rig or sequence; None without any.
         position_68_m: typical 68 % radius of localized photographs, the geometric mean, metres or the scene's unit;
             None if none has one.
-        inlier_count: mean number of matches that agree with the pose of localized photographs; None without any.
+        inlier_count: mean number of matches that agree with the pose of these photographs; None without any.
         adoptions: of a scene, photographs that were considered as references by what became of them: "adopted", or why
             they were not, as of the metric mapless_adoptions_total.
         retirements: of a scene, references that servers retired by themselves, by why, as of mapless_retirements_total.
@@ -81,8 +81,9 @@ class RejectedPosition:
 class PlaceReport:
     """How photographs of a place were answered.
 
-    A place is what is nearer to one surveyed reference than to any other. A photograph that was rejected is counted
-    where its prior says that it was taken, without one at the reference that resembles it most.
+    A place is what is nearer to one surveyed reference than to any other that looks within 60 degrees of the same
+    direction, or to any other where none does. A photograph that was rejected is counted where its prior says that it
+    was taken, without one at the reference that resembles it most.
 
     Attributes:
         reference_id: the surveyed reference; empty for photographs whose place is not known, or whose reference was
@@ -116,8 +117,8 @@ class ReferenceSuggestion:
             their share of all photographs of the place, each of these counted half after every two weeks.
         position: where to take it, world, metres or the scene's unit.
         forward: which way to look, world, unit length.
-        distance_m: distance of the position from the nearest surveyed reference; 0 where no prior says where the
-            photographs were taken.
+        distance_m: distance of the position from the place's reference; 0 where no prior says where the photographs
+            were taken.
         message: one sentence for a person.
     """
 
@@ -197,9 +198,9 @@ def _period(message: pb.PeriodCounts) -> PeriodCounts:
         date.fromisoformat(message.last_day),
         message.localized_count,
         {_name(it, "reason"): it.count for it in message.rejections},
-        message.surveyed_share if message.localized_count else None,
+        message.surveyed_share if message.inlier_count else None,
         message.position_68_m or None,
-        message.inlier_count if message.localized_count else None,
+        message.inlier_count or None,
         dict(message.adoptions),
         dict(message.retirements),
     )

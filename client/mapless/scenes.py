@@ -106,7 +106,7 @@ class AdoptionPolicy:
 
     Attributes:
         most_per_place: most adopted references at a place, which is what is nearer to one surveyed reference than to
-            any other, 1 to 100; the least useful go first.
+            any other that looks within 60 degrees of the same direction, 1 to 100; the least useful go first.
         min_trust: least trust of an answer, above 0, at most 1.
         max_radius_m: largest 68 % radius of an answer's position: 1e-6 to 10 metres, or above 0 in the scene's
             arbitrary unit, for which the default is nothing to go by.

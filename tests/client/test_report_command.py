@@ -32,8 +32,8 @@ def aging(server: RunningServer, scene: str) -> tuple[Store, str]:
     key, other = (store.find_keys(SceneKey(scene), [it])[it] for it in ("r1", "r0"))
     beyond = Sums(8, position_count=8, offset_x=16.0, squared_offset=32.0, forward_z=8.0)
     planted = {
-        CountKey(TODAY - 7, key, LOCALIZED): Sums(20, 20.0, 4000, 20, -80.0),
-        CountKey(TODAY, key, LOCALIZED): Sums(10, 4.0, 1000, 10, -30.0),
+        CountKey(TODAY - 7, key, LOCALIZED): Sums(20, 20, 20.0, 4000, 20, -80.0),
+        CountKey(TODAY, key, LOCALIZED): Sums(10, 10, 4.0, 1000, 10, -30.0),
         CountKey(TODAY, key, "low_overlap"): beyond,
         CountKey(TODAY, key, "gate"): Sums(2),
         CountKey(TODAY - 1, other, "low_texture"): Sums(3),

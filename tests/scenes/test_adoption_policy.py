@@ -10,8 +10,10 @@ from mapless import AdoptionPolicy
 from mapless.geometry import RigidTransform, rotation_from_vector
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
+from mapless_server.scenes.adoption.viewpoints import Viewpoints, surveyed_viewpoints
+from mapless_server.scenes.retrieval.index import SceneIndex
 from mapless_server.security import Principal, Role
-from mapless_server.store.records import Standing
+from mapless_server.store.records import IndexedReference, SceneChanges, Standing
 
 POLICY, OPTIONS = AdoptionPolicy(), AdoptionOptions()
 HERE = RigidTransform(np.eye(3), np.zeros(3))
@@ -121,13 +123,41 @@ def test_a_photograph_counts_for_the_places_around_it() -> None:
 
     def around(x_m: float, distance_m: float, ahead: float = 1.0) -> list[int]:
         centre, axis = np.array([x_m, 0, 0]), np.array([0.0, np.sqrt(1 - ahead**2), ahead])
-        return rules.nearest_viewpoints(centres, axes, centre, axis, OPTIONS, distance_m)
+        return Viewpoints(centres, axes).around(centre, axis, OPTIONS.places, distance_m)
 
     assert around(0.1, 2.0) == [0, 1, 2]
     assert around(0.1, 0.2) == [0]
     assert around(0.1, 10.0) == [0, 1, 2, 3]
     assert around(9.0, 1.0) == [3]
     assert around(0.1, 2.0, ahead=0.0) == [4]  # none looks there
+
+
+def test_places_in_the_tree_are_those_of_all_references() -> None:
+    """Planted among 6,000: ties, photographs whose direction few references or none look in, and far ones."""
+    generator = np.random.default_rng(8)
+    centres = np.repeat(generator.uniform(0, 30, (1500, 3)), 4, axis=0)
+    axes = generator.normal(size=centres.shape) * [1, 1, 0.2]
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    viewpoints = Viewpoints(centres, axes)
+    for turn in np.linspace(0, np.pi / 2, 40):
+        position, forward = generator.uniform(-20, 50, 3), np.array([np.cos(turn), 0, np.sin(turn)])
+        distance = np.linalg.norm(centres - position, axis=1)
+        looks = axes @ forward > 0.5
+        order = np.argsort(np.where(looks, distance, np.inf), kind="stable")[: min(5, looks.sum())]
+        assert viewpoints.looking(position, forward, 5).tolist() == order.tolist()
+        nearest = order[0] if len(order) else distance.argmin()
+        assert (viewpoints.place(position, forward), viewpoints.place(position, None)) == (nearest, distance.argmin())
+
+
+def test_a_tree_is_made_once_per_generation() -> None:
+    index = SceneIndex(4)
+    added = [IndexedReference(name, f"key-{name}", HERE, None) for name in "abc"]
+    index.apply(SceneChanges(1, tuple(added[:2]), frozenset(), True))
+    rows, first = surveyed_viewpoints(index.entries(), ["key-b"])
+    assert rows.tolist() == [0]
+    assert surveyed_viewpoints(index.entries(), ["key-b"])[1] is first
+    index.apply(SceneChanges(2, tuple(added[2:]), frozenset(), False))
+    assert surveyed_viewpoints(index.entries(), ["key-b"])[0].tolist() == [0, 2]
 
 
 def contradicted(days: int, *holders: str, each: int = 1) -> Standing:

@@ -37,7 +37,11 @@ def places() -> Places:
 
 
 def seen(outcome: str = LOW, position: Array | None = None, forward: Array | None = None, like: str = "") -> Sighting:
-    return Sighting(DAY * DAY_US + 5, outcome, position, forward, like)
+    return Sighting(DAY * DAY_US + 5, outcome, position, None, forward, like)
+
+
+def by_prior(position: list[float], sigmas_m: list[float], like: str) -> Sighting:
+    return Sighting(DAY * DAY_US, LOW, np.array(position), np.diag(np.square(sigmas_m)), None, like)
 
 
 @pytest.mark.parametrize(
@@ -69,10 +73,50 @@ def test_rejected_positions_are_summed_around_their_place(places: Places) -> Non
 
 def test_the_surveyed_share_is_that_of_the_matches(places: Places) -> None:
     pose = POSES["b"]
-    it = Sighting(5, LOCALIZED, pose.translation, pose.rotation[:, 2], "b", 80, 0.02, {"b": 60, "adopted": 20})
-    other = Sighting(5, LOCALIZED, pose.translation, pose.rotation[:, 2], "b", 40, 0.08, {"b": 40})
-    (found,) = periods_of(counted([it, other], places), 0, 0, 1)
+    it = Sighting(5, LOCALIZED, pose.translation, None, pose.rotation[:, 2], "b", 80, 0.02, {"b": 60, "adopted": 20})
+    other = Sighting(5, LOCALIZED, pose.translation, None, pose.rotation[:, 2], "b", 40, 0.08, {"b": 40})
+    jointly = Sighting(5, LOCALIZED, reference_id="b", radius_m=0.04)
+    (found,) = periods_of(counted([it, other, jointly], places), 0, 0, 1)
+    assert found.localized.photograph_count == 3
     assert found.means == pytest.approx((0.875, 0.04, 60.0))  # the geometric mean of the radii
+
+
+@pytest.fixture
+def upstairs() -> Places:
+    """Nine surveyed references on a floor at a height of 9 m, every 2 m along x, and as many on that at 0 m."""
+    index = SceneIndex(4)
+    poses = {f"{z}-{x}": RigidTransform(np.eye(3), np.array([x, 0.0, z])) for z in (9, 0) for x in range(0, 18, 2)}
+    added = tuple(IndexedReference(name, f"key-{name}", pose, None) for name, pose in poses.items())
+    index.apply(SceneChanges(1, added, frozenset(), True))
+    return Places(index.entries(), [])
+
+
+@pytest.mark.parametrize(
+    ("sighting", "position"),
+    [
+        (by_prior([4.0, 0, 0], [0.1, 0.1, 1000], "9-6"), [4.0, 0, 9]),  # a receiver that gives no height
+        (by_prior([4.0, 1, 9], [0.1, 0.1, 0.1], "9-16"), [4.0, 1, 9]),
+        (by_prior([0.0, 0, 0], [300, 300, 1000], "9-6"), [6.0, 0, 9]),  # an address
+        (by_prior([4.0, 0, 0], [0.1, 0.1, 0.1], ""), [4.0, 0, 0]),
+        (by_prior([4.0, 0, 0], [0.1, 0.1, 1000], ""), None),
+        (by_prior([900.0, 0, 9], [0.1, 0.1, 0.1], "9-6"), None),  # wrong
+    ],
+)
+def test_a_prior_counts_as_far_as_it_is_certain(
+    upstairs: Places, sighting: Sighting, position: list[float] | None
+) -> None:
+    found = upstairs.position(sighting)
+    assert found == (None if position is None else pytest.approx(np.array(position), abs=0.02))
+
+
+def test_one_wrong_prior_does_not_move_the_mean(upstairs: Places) -> None:
+    right = [by_prior([8.0, 3, 9], [0.01] * 3, "9-8")] * 9
+    found = counted([*right, by_prior([2000.0, 0, 9], [0.01] * 3, "9-8")], upstairs)
+    sums = found[CountKey(DAY, "key-9-8", LOW)]
+    cluster = Cluster.of(sums, RigidTransform(np.eye(3), np.array([8.0, 0, 9])))
+    assert cluster is not None
+    assert (sums.photograph_count, cluster.count) == (10, 9)
+    np.testing.assert_allclose(cluster.position, [8, 3, 9], atol=0.01)
 
 
 def test_a_scene_without_surveyed_references_has_no_places() -> None:

@@ -1,14 +1,17 @@
 """How scenes age, as metrics say it."""
 
+import asyncio
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from support.stores import make_reference
 
 from mapless import Accuracy, AdoptionPolicy, Provenance, Voucher
-from mapless_server.observability.scraped import SceneAge
+from mapless_server.observability.scraped import SceneAge, Scraped
 from mapless_server.security import SceneKey
-from mapless_server.serve.aging import ages
+from mapless_server.serve import aging
+from mapless_server.serve.aging import ages, watch_scenes
 from mapless_server.store import RetirementReason, SceneAttributes, Store, adoption, counts
 from mapless_server.store.counts import DAY_US, LOCALIZED, CountKey, Sums
 from mapless_server.store.records import Standing
@@ -44,3 +47,29 @@ def test_a_scene_that_ages_has_metrics(tmp_path: Path) -> None:
         assert ages(store, 0) == []
         store.delete_scene(HALL)
         assert ages(store, 5) == []
+
+
+def test_what_fails_once_is_looked_up_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever fails; meanwhile metrics say nothing."""
+    looked, scraped = list[int](), Scraped()
+    age = SceneAge(HALL, 8, 0.75, 0.9, 0.35, 1, 2, 1)
+
+    def look(_: Store, most: int) -> list[SceneAge]:
+        looked.append(len(scraped.scenes))
+        if len(looked) == 2:
+            raise ZeroDivisionError
+        return [age]
+
+    async def watched(store: Store) -> None:
+        watching = asyncio.ensure_future(watch_scenes(store, 1, scraped))
+        while len(looked) < 4:
+            await asyncio.sleep(0.002)
+            assert not watching.done()
+        watching.cancel()
+
+    monkeypatch.setattr(aging, "ages", look)
+    monkeypatch.setattr(aging, "FIRST_S", 0.001)
+    monkeypatch.setattr(aging, "AGAIN_S", 0.001)
+    with Store.open(tmp_path) as store:
+        asyncio.run(watched(store))
+    assert looked[:4] == [0, 1, 0, 1]

@@ -1,7 +1,8 @@
 """Photographs of answers as they are counted: rigs, several scenes, priors; planted answers."""
 
 import asyncio
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,10 +21,11 @@ from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.rejection import PoseHypothesis, Rejection, RejectionReason
 from mapless_server.observability.metrics import Metrics
 from mapless_server.scenes import ANYWHERE, Cone, Narrowing, Sphere
+from mapless_server.scenes.retrieval.index import SceneIndex
 from mapless_server.security import SceneKey
 from mapless_server.serve import counting
 from mapless_server.serve.counting import Counting, Noted
-from mapless_server.store import Store
+from mapless_server.store import Store, counts
 from mapless_server.store.counts import DAY_US, LOCALIZED, read_report
 from mapless_server.store.rows import now_us
 
@@ -79,21 +81,27 @@ AT = PosePrior(RigidTransform(np.eye(3), np.array([1.0, 2.0, 3.0])), np.eye(6))
 
 
 @pytest.mark.parametrize(
-    ("priors", "narrowing", "position", "forward"),
+    ("priors", "narrowing", "position", "variance", "forward"),
     [
-        (Priors(), ANYWHERE, None, None),
-        (Priors(pose=AT), ANYWHERE, [1, 2, 3], [0, 0, 1]),
-        (Priors(position=PositionPrior(np.ones(3), np.eye(3))), ANYWHERE, [1, 1, 1], None),
-        (Priors(pose=AT, heading=look(1, 0, 0)), ANYWHERE, [1, 2, 3], [1, 0, 0]),
-        (Priors(), Narrowing(Sphere(np.ones(3), 5.0), Cone(np.array([0.0, 1.0, 0.0]), 30.0)), [1, 1, 1], [0, 1, 0]),
+        (Priors(), ANYWHERE, None, None, None),
+        (Priors(pose=AT), ANYWHERE, [1, 2, 3], 1, [0, 0, 1]),
+        (Priors(position=PositionPrior(np.ones(3), 4 * np.eye(3))), ANYWHERE, [1, 1, 1], 4, None),
+        (Priors(pose=AT, heading=look(1, 0, 0)), ANYWHERE, [1, 2, 3], 1, [1, 0, 0]),
+        (Priors(), Narrowing(Sphere(np.ones(3), 5.0), Cone(np.array([0.0, 1.0, 0.0]), 30.0)), [1, 1, 1], 5, [0, 1, 0]),
     ],
 )
 def test_a_rejected_photograph_is_where_its_priors_say(
-    priors: Priors, narrowing: Narrowing, position: list[int] | None, forward: list[int] | None
+    priors: Priors,
+    narrowing: Narrowing,
+    position: list[int] | None,
+    variance: int | None,
+    forward: list[int] | None,
 ) -> None:
     (it,) = noted([photograph(LOW, priors=priors, narrowing=narrowing)], LOW)
     found = (it.sighting.position, it.sighting.forward)
     assert [None if each is None else each.tolist() for each in found] == [position, forward]
+    covariance = it.sighting.covariance
+    assert (None if covariance is None else covariance.tolist()) == (variance and (variance * np.eye(3)).tolist())
 
 
 def test_a_pose_that_was_too_uncertain_says_where_it_was() -> None:
@@ -128,6 +136,9 @@ def test_what_waits_is_bounded_and_dropped_ones_are_counted(monkeypatch: pytest.
         it.note([photograph(LOW)] * 3, GATE, nothing)
     assert len(it._waiting) == 2
     assert metrics.registry.get_sample_value("mapless_scene_counts_dropped_total") == 4
+    for _ in range(3):
+        it.count_in_scene(HALL, "adoptions", 1, "adopted")
+    assert metrics.registry.get_sample_value("mapless_scene_counts_dropped_total") == 5
 
 
 def test_photographs_wait_while_the_store_is_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,3 +175,71 @@ def test_what_is_adopted_or_retired_is_counted_in_its_scene(tmp_path: Path) -> N
     assert by_name == {"adoptions:adopted": 2, "adoptions:nothing_new": 1, "retirements:contradicted": 2}
     assert found.counts == {}
     assert metrics.registry.get_sample_value("mapless_adoptions_total", {"result": "adopted"}) == 3
+
+
+@pytest.fixture
+def counted_scenes(tmp_path: Path) -> Iterator[tuple[Store, Counting, Metrics]]:
+    """Two scenes with a reference each, their store, and what counts."""
+    with Store.open(tmp_path) as store:
+        for key in (HALL, YARD):
+            store.create_scene(key)
+            store.add_references(key, [make_reference("r1")])
+        indexes = SimpleNamespace(entries=lambda *_, **__: SceneIndex(4).entries())
+        engine: Any = SimpleNamespace(
+            references=SimpleNamespace(retrievals=[SimpleNamespace(indexes=indexes)]),
+            queue=SimpleNamespace(prompt_count=0),
+        )
+        metrics = Metrics()
+        yield store, Counting(engine, store, metrics, 400), metrics
+
+
+def photographs_in(store: Store, scene_key: SceneKey) -> int:
+    found = read_report(store.database, scene_key, 0, now_us() // DAY_US, 9).counts
+    return sum(it.photograph_count for it in found.values())
+
+
+def test_photographs_are_counted_once_when_the_server_stops(
+    counted_scenes: tuple[Store, Counting, Metrics], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It stops while they are written."""
+    store, it, _ = counted_scenes
+    begins, ends, add = threading.Event(), threading.Event(), counts.add_counts
+
+    def slowly(*its: Any) -> None:
+        begins.set()
+        ends.wait(9)
+        add(*its)
+
+    async def stopped() -> None:
+        running = asyncio.ensure_future(it.run())
+        await asyncio.to_thread(begins.wait, 9)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        it.note([photograph(LOW)], LOW, None)
+        asyncio.get_running_loop().call_later(0.05, ends.set)
+        await it.close()
+
+    monkeypatch.setattr(counting, "WRITE_S", 0.001)
+    monkeypatch.setattr("mapless_server.store.counts.add_counts", slowly)
+    it.note([photograph(LOW)] * 3, LOW, None)
+    asyncio.run(stopped())
+    assert photographs_in(store, HALL) == 4
+
+
+def test_a_scene_that_cannot_be_counted_costs_no_other(
+    counted_scenes: tuple[Store, Counting, Metrics], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, it, metrics = counted_scenes
+    indexes: Any = it._engine.references.retrievals[0].indexes
+
+    def damaged(scene_key: SceneKey, *_: Any, **__: Any) -> Any:
+        if scene_key == HALL:
+            raise ZeroDivisionError
+        return SceneIndex(4).entries()
+
+    monkeypatch.setattr(indexes, "entries", damaged)
+    it.note([photograph(LOW)] * 2, LOW, None)
+    it.note([photograph(LOW, scene_key=YARD)], LOW, None)
+    asyncio.run(it.write())
+    assert (photographs_in(store, HALL), photographs_in(store, YARD), len(it._waiting)) == (0, 1, 0)
+    assert metrics.registry.get_sample_value("mapless_scene_counts_dropped_total") == 2

@@ -45,30 +45,32 @@ def reported(client: Client, scene: str, count: int) -> SceneReport:
 
 
 def test_photographs_are_counted_by_place_and_reason(client: Client, scene: str, method: Staged) -> None:
-    """Localized ones at the pose of r0; the others were taken 40 m beyond the last reference, by their prior."""
+    """Localized ones at the pose of r0; the others were taken 1.5 m beyond the last reference, by their prior."""
+    today = datetime.now(timezone.utc).date()
     client.localize(PHOTO, CAMERA, scene)
     method.outcome = ELSEWHERE
-    beyond = Priors(position=PositionPrior(np.array([42.0, 0.0, 0.0]), covariance_m2=np.eye(3)))
+    beyond = Priors(position=PositionPrior(np.array([3.5, 2.0, -1.0]), covariance_m2=1e-4 * np.eye(3)))
     for _ in range(3):
         client.localize(PHOTO, CAMERA, scene, priors=beyond)
     client.localize(PHOTO, CAMERA, scene, priors=beyond, confidential=True)
     method.outcome = None
     report = reported(client, scene, 4)
-    today = datetime.now(timezone.utc).date()
-    assert (report.first_day, report.last_day, len(report.periods)) == (today - timedelta(days=27), today, 4)
+    last = report.last_day
+    assert last in (today, today + timedelta(days=1))
+    assert (report.first_day, len(report.periods)) == (last - timedelta(days=27), 4)
     assert (report.periods[-1].localized_count, report.periods[-1].rejections) == (1, {"LOW_OVERLAP": 3})
     assert report.periods[-1].surveyed_share == 1.0
     assert report.periods[0].photograph_count == 0
     beyond_r2, at_r0 = report.places
     assert (beyond_r2.reference_id, at_r0.reference_id) == ("r2", "r0")
     assert beyond_r2.rejected_position is not None
-    assert beyond_r2.rejected_position.position == pytest.approx((42.0, 0.0, 0.0))
+    assert beyond_r2.rejected_position.position == pytest.approx((3.5, 2.0, -1.0), abs=0.001)
     assert beyond_r2.rejected_position.photograph_count == 3
     (suggested,) = report.suggestions
     assert suggested.place_id == "r2"
-    assert [suggested.photograph_count, suggested.distance_m] == pytest.approx([3.0, 40.0], rel=0.01)
+    assert [suggested.photograph_count, suggested.distance_m] == pytest.approx([3.0, 1.5], rel=0.01)
     assert "3 of 3 photographs around r2 were rejected" in suggested.message
-    assert "40 m from r2, looking along (" in suggested.message
+    assert "1.5 m from r2, looking along (" in suggested.message
     assert ") as r2, since no prior says it: add references there" in suggested.message
 
 
@@ -90,9 +92,13 @@ def test_old_and_new_weeks_differ(client: Client, server: RunningServer, scene: 
     store = server.engine.references.retrievals[0].indexes._store
     day = (date(2026, 3, 2) - date(1970, 1, 1)).days
     planted = {
-        CountKey(day, "gone", LOCALIZED): Sums(photograph_count=9, surveyed_share=8.1),
+        CountKey(day, "gone", LOCALIZED): Sums(
+            photograph_count=9, support_count=9, surveyed_share=8.1, inlier_count=90
+        ),
         CountKey(day + 7, "gone", "low_overlap"): Sums(photograph_count=6),
-        CountKey(day + 7, "gone", LOCALIZED): Sums(photograph_count=3, surveyed_share=1.2),
+        CountKey(day + 7, "gone", LOCALIZED): Sums(
+            photograph_count=3, support_count=3, surveyed_share=1.2, inlier_count=30
+        ),
     }
     counts.add_counts(store.database, {SceneKey(scene): planted})
     report = client.get_scene_report(scene, first_day=date(2026, 3, 2), last_day=date(2026, 3, 15))
@@ -110,6 +116,8 @@ def test_old_and_new_weeks_differ(client: Client, server: RunningServer, scene: 
         ({"first_day": "20261102"}, "first_day"),
         ({"last_day": "2026-02-30"}, "last_day"),
         ({"last_day": "2026-W10-1"}, "last_day"),
+        ({"last_day": "0001-01-03"}, "last_day"),
+        ({"first_day": "1969-12-31", "last_day": "1970-01-02"}, "first_day"),
         ({"first_day": "2026-03-02", "last_day": "2026-03-01"}, "first_day"),
         ({"first_day": "1970-01-01", "last_day": "2026-03-01"}, "first_day"),
         ({"days_per_period": -1}, "days_per_period"),

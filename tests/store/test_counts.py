@@ -31,9 +31,9 @@ def test_counts_of_one_key_add_up(place: Place) -> None:
     with place.open() as store:
         store.create_scene(HALL)
         counts.add_counts(store.database, {HALL: {KEY: ONE}})
-        counts.add_counts(store.database, {HALL: {KEY: ONE.times(2), other: Sums(1, 0.5, 40, 1, -3.0)}})
+        counts.add_counts(store.database, {HALL: {KEY: ONE.times(2), other: Sums(1, 1, 0.5, 40, 1, -3.0)}})
     with place.open() as store:
-        assert stored(store) == {KEY: ONE.times(3), other: Sums(1, 0.5, 40, 1, -3.0)}
+        assert stored(store) == {KEY: ONE.times(3), other: Sums(1, 1, 0.5, 40, 1, -3.0)}
 
 
 def test_counts_of_two_servers_add_up(shared: Shared) -> None:

@@ -80,7 +80,7 @@ COUNTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
         ("contradicted", "survey_outdated", "vouchers_gone"),
     ),
     "adopted_expired": ("Adopted references that were deleted because of their age.", *_ALONE),
-    "scene_counts_dropped": ("Answered photographs that reports of scenes lack, since the store was away.", *_ALONE),
+    "scene_counts_dropped": ("What reports of scenes lack: the store was away, or it could not be counted.", *_ALONE),
     "fatal": ("Faults that end the process.", *_ALONE),
     "captured": ("Calls that were captured.", *_ALONE),
     "capture_dropped": (

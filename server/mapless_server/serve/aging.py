@@ -18,15 +18,17 @@ DAYS = 7
 
 
 async def watch_scenes(store: Store, most: int, scraped: Scraped) -> None:
-    """Has metrics say how at most so many scenes age, every few minutes until it is cancelled."""
+    """Has metrics say how at most so many scenes age, every few minutes until it is cancelled; none after a failure."""
     pause_s = FIRST_S
     while True:
         await asyncio.sleep(pause_s)
         pause_s = AGAIN_S
         try:
             scraped.scenes = await asyncio.to_thread(ages, store, most)
-        except RequestError as error:  # the store is away
-            log.warning("how scenes age is not known: %s", error)
+        except Exception as error:  # must not end the looking
+            scraped.scenes = ()
+            is_away = isinstance(error, RequestError)
+            log.log(logging.WARNING if is_away else logging.ERROR, "how scenes age is not known: %r", error)
 
 
 def ages(store: Store, most: int) -> list[SceneAge]:

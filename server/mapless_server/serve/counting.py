@@ -1,20 +1,20 @@
 """Counts answered photographs for reports of scenes: noted on the event loop, written in batches in the background.
 
-Noting one takes microseconds. What waits when the process is killed is lost, and so are photographs beyond
-`MOST_WAITING`, as while the store is away; a server that stops writes them.
+Noting one takes microseconds. What waits when the process is killed is lost, and so is what comes beyond
+`MOST_WAITING`, as while the store is away; a server that stops writes it. A thread that gives way to queries counts.
 """
 
 import asyncio
 import logging
-import math
 import time
 from collections import defaultdict, deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapless.geometry import Array
+from mapless.geometry import MAX_COORDINATE_M, Array
 from mapless.names import parse_reference_name
 from mapless_server.engine.query import Query, Result, SceneQuestion
 from mapless_server.engine.queue_engine import QueueEngine
@@ -26,6 +26,7 @@ from mapless_server.method.rejection import Rejection
 from mapless_server.scenes import Narrowing
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.report.counting import Places, Sighting, counted
+from mapless_server.scheduling.processor import give_way, lower_priority
 from mapless_server.security import SceneKey
 from mapless_server.services.photographs import question_in
 from mapless_server.store import Store, adoption, counts
@@ -40,6 +41,9 @@ TIDY_S = 3600.0
 """Time between deletions of old counts."""
 MOST_WAITING = 10_000
 """Photographs that wait to be written, some 20 MB."""
+
+Happened = tuple[SceneKey, int, str, int]
+"""What happened in a scene: when, microseconds since 1970, and how often."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +68,9 @@ class Counting(BackgroundObserver):
         self._observer = observer
         self._days = days
         self._waiting = deque[Noted]()
-        self._happened = deque[tuple[SceneKey, int, str, int]]()
-        """What happened in scenes: when, microseconds since 1970, and how often."""
+        self._happened = deque[Happened]()
+        self._writing: asyncio.Future[None] | None = None
+        self._thread = ThreadPoolExecutor(1, "counting", lower_priority, (lambda: engine.queue.prompt_count > 0,))
 
     def note(self, parts: Sequence[tuple[Query, Result]], outcome: object, localization: object) -> None:
         """Remembers the photographs of an answer; called on the event loop.
@@ -76,7 +81,7 @@ class Counting(BackgroundObserver):
             return
         room = MOST_WAITING - len(self._waiting)
         if room < len(parts):
-            self._observer.count("scene_counts_dropped", len(parts) - max(0, room))
+            self._dropped(len(parts) - max(0, room))
         for query, result in parts[: max(0, room)]:
             scene_key = result.scene_key or (None if query.scenes else query.scene_key)
             if scene_key is not None:
@@ -91,8 +96,12 @@ class Counting(BackgroundObserver):
     def count_in_scene(self, scene_key: SceneKey, name: str, amount: int = 1, result: str = "") -> None:
         """Implements BackgroundObserver."""
         self._observer.count(name, amount, result)
-        if self._days and amount and len(self._happened) < MOST_WAITING:
+        if not self._days or not amount:
+            return
+        if len(self._happened) < MOST_WAITING:
             self._happened.append((scene_key, now_us(), counts.happening(name, result), amount))
+        else:
+            self._dropped(1)
 
     async def run(self) -> None:
         """Writes what waits until it is cancelled, and deletes old counts; a failure is logged, and tried again."""
@@ -108,45 +117,77 @@ class Counting(BackgroundObserver):
             except RequestError as error:  # the store is away
                 log.warning("photographs could not be counted: %s", error)
             except Exception as error:  # must not end the counting
-                self._waiting.clear()
-                self._happened.clear()
-                log.error("photographs could not be counted, and are left out", exc_info=error)
+                log.error("photographs could not be counted", exc_info=error)
 
     async def write(self) -> None:
-        """Writes what waits, if there is anything; RequestError if the store is away, then it waits on."""
+        """Writes what waits, or waits for the end of a write; RequestError if the store is away, then it waits on.
+
+        A write goes on to its end if the caller is cancelled: what is in the store must not wait any more.
+        """
+        if self._writing is None or self._writing.done():
+            self._writing = asyncio.ensure_future(self._write_waiting())
+        await asyncio.shield(self._writing)
+
+    async def close(self) -> None:
+        """Writes what waits, after `run` was cancelled; what cannot be written is lost, and logged."""
+        try:
+            await self.write()  # that which `run` had begun, if it had
+            await self.write()
+        except Exception as error:
+            log.warning("%d photographs could not be counted: %s", len(self._waiting), error)
+        self._thread.shutdown(wait=False)
+
+    async def _write_waiting(self) -> None:
         noted, happened = list(self._waiting), list(self._happened)
         if noted or happened:
-            await asyncio.to_thread(self._write, noted, happened)
+            try:
+                await asyncio.get_running_loop().run_in_executor(self._thread, self._write, noted, happened)
+            except RequestError:
+                raise
+            except Exception as error:  # of no scene alone; would come again
+                self._dropped(len(noted) + len(happened))
+                log.error("photographs could not be counted, and are left out", exc_info=error)
             for _ in noted:
                 self._waiting.popleft()
             for _ in happened:
                 self._happened.popleft()
 
-    async def close(self) -> None:
-        """Writes what waits, after `run` was cancelled; what cannot be written is lost, and logged."""
-        try:
-            await self.write()
-        except RequestError as error:
-            log.warning("%d photographs could not be counted: %s", len(self._waiting), error)
+    def _dropped(self, count: int) -> None:
+        self._observer.count("scene_counts_dropped", count)
 
-    def _write(self, noted: Sequence[Noted], happened: Sequence[tuple[SceneKey, int, str, int]] = ()) -> None:
-        of_scene = defaultdict[SceneKey, list[Noted]](list)
+    def _write(self, noted: Sequence[Noted], happened: Sequence[Happened] = ()) -> None:
+        of_scene = defaultdict[SceneKey, tuple[list[Noted], list[Happened]]](lambda: ([], []))
         for it in noted:
-            of_scene[it.scene_key].append(it)
-        created_us = counts.scenes_created(self._store.database, {*of_scene, *(it[0] for it in happened)})
-        found = {
-            # A photograph of a scene that was deleted, and made again, is not of the new one.
-            key: self._counted(key, [it for it in its if it.sighting.time_us >= created_us[key]])
-            for key, its in of_scene.items()
-            if key in created_us
-        }
-        for scene_key, time_us, outcome, amount in happened:
-            if time_us >= created_us.get(scene_key, math.inf):
-                its, key = found.setdefault(scene_key, {}), CountKey(time_us // DAY_US, "", outcome)
-                its[key] = its.get(key, Sums()) + Sums(photograph_count=amount)
+            of_scene[it.scene_key][0].append(it)
+        for that in happened:
+            of_scene[that[0]][1].append(that)
+        created_us = counts.scenes_created(self._store.database, of_scene.keys())
+        found = dict[SceneKey, Mapping[CountKey, Sums]]()
+        for key, (its, those) in of_scene.items():
+            if key in created_us:
+                try:
+                    found[key] = self._sums(key, its, those, created_us[key])
+                except RequestError:
+                    raise
+                except Exception as error:  # must not cost other scenes their counts
+                    self._dropped(len(its) + len(those))
+                    log.error("photographs of scene %s could not be counted, and are left out", key, exc_info=error)
         counts.add_counts(self._store.database, found)
 
+    def _sums(
+        self, scene_key: SceneKey, noted: Sequence[Noted], happened: Sequence[Happened], since_us: int
+    ) -> dict[CountKey, Sums]:
+        """What is counted in a scene; what is older is of one that had its id before."""
+        found = self._counted(scene_key, [it for it in noted if it.sighting.time_us >= since_us])
+        for _, time_us, outcome, amount in happened:
+            if time_us >= since_us:
+                key = CountKey(time_us // DAY_US, "", outcome)
+                found[key] = found.get(key, Sums()) + Sums(photograph_count=amount)
+        return found
+
     def _counted(self, scene_key: SceneKey, noted: Sequence[Noted]) -> dict[CountKey, Sums]:
+        if not noted:
+            return {}
         try:
             indexes = self._engine.references.retrievals[0].indexes
             entries = indexes.entries(scene_key, StageContext(lambda: None), waits=False)
@@ -154,7 +195,13 @@ class Counting(BackgroundObserver):
         except (NotFound, DataLoss) as error:  # it was deleted meanwhile, or cannot be read
             log.info("photographs of scene %s are not counted: %s", scene_key, error)
             return {}
-        return counted([_with_priors(it) for it in noted], Places(entries, adopted))
+        return counted(_giving_way(noted), Places(entries, adopted))
+
+
+def _giving_way(noted: Sequence[Noted]) -> Iterator[Sighting]:
+    for it in noted:
+        give_way()
+        yield _with_priors(it)
 
 
 def _localized(result: Result, localization: object) -> Sighting:
@@ -166,6 +213,7 @@ def _localized(result: Result, localization: object) -> Sighting:
         now_us(),
         LOCALIZED,
         None if pose is None else pose.translation,
+        None,
         None if pose is None else pose.rotation[:, 2],
         _most_similar(result),
         answer.outcome.inlier_count if isinstance(answer.outcome, Localization) else 0,
@@ -181,10 +229,10 @@ def _rejected(query: Query, result: Result, joint: object) -> Sighting:
     assert isinstance(rejection, Rejection)
     known = alone if isinstance(alone, Localization) else rejection.imprecise
     if known is None:
-        position, forward = _expected(query.priors, query.narrowing)
+        expected = _expected(query.priors, query.narrowing)
     else:
-        position, forward = known.world_from_camera.translation, known.world_from_camera.rotation[:, 2]
-    return Sighting(now_us(), rejection.reason.value, position, forward, _most_similar(result))
+        expected = known.world_from_camera.translation, None, known.world_from_camera.rotation[:, 2]
+    return Sighting(now_us(), rejection.reason.value, *expected, _most_similar(result))
 
 
 def _with_priors(noted: Noted) -> Sighting:
@@ -193,24 +241,26 @@ def _with_priors(noted: Noted) -> Sighting:
     if not noted.scenes or it.position is not None:
         return it
     question = question_in(noted.scenes, noted.scene_key)
-    position, forward = _expected(question.priors, question.narrowing)
-    return replace(it, position=position, forward=forward)
+    position, covariance, forward = _expected(question.priors, question.narrowing)
+    return replace(it, position=position, covariance=covariance, forward=forward)
 
 
-def _expected(priors: Priors, narrowing: Narrowing) -> tuple[Array | None, Array | None]:
-    """Position (3,) and viewing direction (3,) by priors, or by the centres of limits; None where there are none."""
-    position = forward = None
+def _expected(priors: Priors, narrowing: Narrowing) -> tuple[Array | None, Array | None, Array | None]:
+    """Position (3,), its covariance (3, 3), viewing direction (3,), world, by priors or by limits; None without."""
+    position = covariance = forward = None
     if priors.pose is not None:
         position, forward = priors.pose.world_from_camera.translation, priors.pose.world_from_camera.rotation[:, 2]
+        covariance = priors.pose.covariance[:3, :3]
     if priors.position is not None:
-        position = priors.position.position
+        position, covariance = priors.position.position, priors.position.covariance
     elif narrowing.position is not None and position is None:
         position = narrowing.position.position
+        covariance = min(narrowing.position.radius_m, MAX_COORDINATE_M) ** 2 / 5 * np.eye(3)  # of a full sphere
     if priors.heading is not None:
         forward = np.asarray(priors.heading.in_world)
     elif narrowing.heading is not None and forward is None:
         forward = narrowing.heading.forward
-    return position, forward
+    return position, covariance, forward
 
 
 def _most_similar(result: Result) -> str:

@@ -81,7 +81,9 @@ def days_from_message(request: pb.GetSceneReportRequest, today: date) -> tuple[i
         raise FieldError("days_per_period", f"must be 0 to {MOST_PERIOD_DAYS}, is {request.days_per_period}")
     period = request.days_per_period or DEFAULT_PERIOD_DAYS
     last = _day(request.last_day, "last_day") if request.last_day else (today - EPOCH).days
-    first = _day(request.first_day, "first_day") if request.first_day else last - DEFAULT_PERIODS * period + 1
+    first = max(0, last - DEFAULT_PERIODS * period + 1)
+    if request.first_day:
+        first = _day(request.first_day, "first_day")
     if first > last:
         raise FieldError("first_day", f"must not be after last_day, {_text(last)}, is {_text(first)}")
     if last - first >= MOST_DAYS:
@@ -94,9 +96,9 @@ def days_from_message(request: pb.GetSceneReportRequest, today: date) -> tuple[i
 def _day(text: str, field: str) -> int:
     with suppress(ValueError):
         day = date.fromisoformat(text)
-        if day.isoformat() == text:  # Python reads other forms, too
+        if day >= EPOCH and day.isoformat() == text:  # Python reads other forms, too
             return (day - EPOCH).days
-    raise FieldError(field, f"must be a day such as 2026-11-02, is {names.shown(text)}")
+    raise FieldError(field, f"must be a day such as 2026-11-02, from 1970 to 9999, is {names.shown(text)}")
 
 
 def _text(day: int) -> str:
@@ -187,7 +189,8 @@ def _sentence(it: Suggestion, reference_id: str, unit: str, is_outdated: bool) -
     if is_outdated:
         return f"{many}, {why}; the place has changed: survey it again, around ({x:.2f}, {y:.2f}, {z:.2f})"
     if it.positioned_share < 0.5:
-        return f"{many}, {why}; no prior says where they were taken: add references of what is seen from there"
+        few = "few priors say" if it.positioned_share else "no prior says"
+        return f"{many}, {why}; {few} where they were taken: add references of what is seen from there"
     along = ", ".join(f"{each:.1f}" for each in it.forward.tolist())
     where = f"on average at ({x:.2f}, {y:.2f}, {z:.2f}), {it.distance_m:.2g} {unit} from {reference_id}"
     looking = f"looking along ({along})" + (

@@ -49,8 +49,10 @@ class Sums:
 
     Attributes:
         photograph_count: number of photographs.
-        surveyed_share: of localized ones, shares of their matches that surveyed references have.
-        inlier_count: of localized ones, matches that agree with their pose.
+        support_count: localized photographs whose matches agree with a pose of their own; of others, which only a rig
+            or a sequence localizes, the next two are not known.
+        surveyed_share: shares of these matches that surveyed references have.
+        inlier_count: these matches.
         radius_count, log_radius: photographs with a 68 % radius, and its natural logarithms, metres.
         position_count: rejected photographs whose position is known.
         offset_x, offset_y, offset_z: their offsets from the place's reference, world axes, metres.
@@ -59,6 +61,7 @@ class Sums:
     """
 
     photograph_count: int = 0
+    support_count: int = 0
     surveyed_share: float = 0.0
     inlier_count: int = 0
     radius_count: int = 0

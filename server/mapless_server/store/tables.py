@@ -222,6 +222,7 @@ scene_count = Table(
     Column("place_key", _Key, primary_key=True),
     Column("outcome", String(32), primary_key=True),
     Column("photograph_count", BigInteger, nullable=False),
+    Column("support_count", BigInteger, nullable=False),  # photographs with matches of their own
     Column("surveyed_share", Double, nullable=False),
     Column("inlier_count", BigInteger, nullable=False),
     Column("radius_count", BigInteger, nullable=False),  # photographs with a radius

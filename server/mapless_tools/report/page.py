@@ -32,6 +32,8 @@ MOST_ROWS = 300
 """Rows of a table; the plan has all places."""
 _MARGIN = 0.08
 """Of the plan's extent, around it."""
+_REACH = 0.5
+"""What is further from all places than this share of their extent is not on the plan: it would become small."""
 
 
 @dataclass(frozen=True)
@@ -140,9 +142,13 @@ def _floor_title(index: int, floors: Sequence[tuple[float, float]], unit: str) -
 
 
 def _shown(report: SceneReport, places: Sequence[Place], basis: Array) -> tuple[Array, Array]:
-    """Corners (2,) each of what plans show: all places, rejections and suggestions."""
-    points = [it.world_from_camera.translation for it in places] + [it.rejected_at for it in places if it.rejections]
-    flat = np.stack(points + [np.asarray(it.position, float) for it in report.suggestions]) @ basis.T
+    """Corners (2,) each of what plans show: all places, and rejections and suggestions within half their extent."""
+    centres = np.stack([it.world_from_camera.translation for it in places]) @ basis.T
+    low, high = centres.min(axis=0), centres.max(axis=0)
+    reach = _REACH * (float((high - low).max()) or 1.0)
+    others = [it.rejected_at for it in places if it.rejections]
+    others += [np.asarray(it.position, float) for it in report.suggestions]
+    flat = np.concatenate([centres, *(np.clip(basis @ it, low - reach, high + reach)[None] for it in others)])
     low, high = flat.min(axis=0), flat.max(axis=0)
     extent = float((high - low).max()) or 1.0
     short = np.maximum(0.0, 0.25 * extent - (high - low)) / 2  # no strip without height
@@ -182,7 +188,8 @@ def _notes(report: SceneReport, scene: Scene, places: Sequence[Place], omitted_c
     """How to read the plan."""
     notes = [
         "The nose of a place points where its reference looks; without one it looks up or down. A place is what is "
-        "nearer to its reference than to any other."
+        "nearer to its reference than to any other that looks within 60 degrees of the same direction, or to any other "
+        "where none does."
     ]
     if places:
         view = vertical_of(scene, [it.world_from_camera for it in places])[1]
@@ -192,7 +199,7 @@ def _notes(report: SceneReport, scene: Scene, places: Sequence[Place], omitted_c
         notes.append(
             f"The area of a ring grows with the number of rejected photographs; the largest has {most}. It is where "
             "their priors place them on average, if half of them or more had one, else around the reference that "
-            "resembles them most."
+            "resembles them most. What is further from all places than half of their extent is not on the plan."
         )
     unplaced = sum(it.rejected_count for place in report.places if not place.reference_id for it in place.periods)
     if unplaced:

@@ -200,31 +200,6 @@ def mask_of(ignored: NDArray[np.bool_]) -> bytes:
     return png.tobytes()
 
 
-def nearest_place(centres: Array, axes: Array, position: Array, forward: Array | None) -> int:
-    """Index of the reference that stands nearest to a position, of those that look within 60 degrees, or of all.
-
-    Of all, too, where the direction is not known. Centres and unit axes, (N, 3), position and direction, (3,), are in
-    the world; N is at least 1.
-    """
-    distance = np.linalg.norm(centres - position, axis=1)
-    looks = np.zeros(len(axes), bool) if forward is None else axes @ forward > 0.5
-    return int(np.where(looks, distance, np.inf).argmin() if looks.any() else distance.argmin())
-
-
-def nearest_viewpoints(
-    centres: Array, axes: Array, centre: Array, axis: Array, options: AdoptionOptions, distance_m: float = math.inf
-) -> list[int]:
-    """Indices of the references around a viewpoint, the nearest first: `places` of those that look within 60 degrees.
-
-    The first is that of `nearest_place`; the others stand within this distance, that of what a photograph there shows.
-    Centres and unit axes, (N, 3) and (3,), are in the world; N is at least 1.
-    """
-    distance = np.linalg.norm(centres - centre, axis=1)
-    order = np.argsort(np.where(axes @ axis > 0.5, distance, np.inf), kind="stable")[: options.places]
-    others = [int(it) for it in order[1:] if axes[it] @ axis > 0.5 and distance[it] <= distance_m]
-    return [nearest_place(centres, axes, centre, axis), *others]
-
-
 def should_show(
     centres: Array, axes: Array, pose: RigidTransform, distance_m: float, options: AdoptionOptions
 ) -> NDArray[np.intp]:

@@ -7,10 +7,10 @@ import numpy as np
 from mapless_server.store.counts import DAY_US, CountKey, Sums
 from mapless_server.store.surveys import Surveyed
 
-from ..adoption.policy import nearest_place
+from ..adoption.viewpoints import Viewpoints
 
 MOST_ADDED = 1000
-"""References that are looked at, the last ones that were added; each is compared with all of the scene."""
+"""References that are looked at, the last ones that were added."""
 
 
 def added_days(surveyed: Sequence[Surveyed], first_day: int) -> dict[str, int]:
@@ -25,12 +25,14 @@ def added_days(surveyed: Sequence[Surveyed], first_day: int) -> dict[str, int]:
     centres = np.stack([it.world_from_camera.translation for it in surveyed])
     axes = np.stack([it.world_from_camera.rotation[:, 2] for it in surveyed])
     found = dict[str, int]()
-    for i in np.argsort(-days, kind="stable")[:MOST_ADDED].tolist():
-        before = np.flatnonzero(days < days[i])
-        if days[i] < first_day or not len(before):
+    last = np.argsort(-days, kind="stable")[:MOST_ADDED]
+    for day in sorted({*days[last].tolist()}, reverse=True):
+        before = np.flatnonzero(days < day)
+        if day < first_day or not len(before):
             break
-        at = before[nearest_place(centres[before], axes[before], centres[i], axes[i])]
-        found.setdefault(surveyed[at].key, int(days[i]))
+        viewpoints = Viewpoints(centres[before], axes[before])
+        for i in last[days[last] == day].tolist():
+            found.setdefault(surveyed[before[viewpoints.place(centres[i], axes[i])]].key, day)
     return found
 
 

@@ -58,11 +58,11 @@ class Period:
     def means(self) -> tuple[float, float, float]:
         """Of localized photographs: share of surveyed support, radius (geometric mean), metres, and inliers.
 
-        The first and the last are means; 0 where unknown.
+        The first and the last are means over those with matches of their own; 0 where unknown.
         """
         its = self.localized
         radius_m = math.exp(its.log_radius / its.radius_count) if its.radius_count else 0.0
-        count = max(its.photograph_count, 1)
+        count = max(its.support_count, 1)
         return its.surveyed_share / count, radius_m, its.inlier_count / count
 
     @property

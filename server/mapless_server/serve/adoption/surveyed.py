@@ -5,7 +5,6 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.engine.query import Caller, Query, Result
@@ -15,7 +14,8 @@ from mapless_server.method.options import StageContext
 from mapless_server.scenes import ANYWHERE
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
-from mapless_server.scenes.retrieval.index import Entries
+from mapless_server.scenes.adoption.viewpoints import Viewpoints, surveyed_viewpoints
+from mapless_server.scenes.retrieval.index import Entries, Rows
 from mapless_server.scheduling import Flow
 from mapless_server.security import SceneKey, tenant_of
 from mapless_server.store import Store, adoption
@@ -81,38 +81,36 @@ class SurveyedLocalizer:
     ) -> Place | None:
         """The references around a pose at which a photograph shows what is so far away; None without surveyed ones."""
         entries = self._entries(scene_key)
-        rows = self._surveyed_rows(scene_key, entries)
-        distance = np.linalg.norm(entries.centres(rows) - pose.translation, axis=1)
-        if len(rows) > MOST_CHOSEN_AMONG:
-            some = np.argpartition(distance, MOST_CHOSEN_AMONG)[:MOST_CHOSEN_AMONG]
-            rows, distance = rows[some], distance[some]
-        chosen = rows[np.argsort(distance, kind="stable")]
-        if not len(chosen):
+        rows, viewpoints = self._surveyed(scene_key, entries)
+        if not len(rows):
             return None
-        centres, axes = entries.centres(chosen), entries.axes(chosen)
-        ids, keys = zip(*(entries.reference(row)[:2] for row in chosen.tolist()), strict=True)
-        around = rules.nearest_viewpoints(centres, axes, pose.translation, pose.rotation[:, 2], options, distance_m)
-        return Place(ids, keys, centres, axes, around)
+        around = viewpoints.around(pose.translation, pose.rotation[:, 2], options.places, distance_m)
+        nearest = viewpoints.nearest(pose.translation, MOST_CHOSEN_AMONG).tolist()
+        chosen = list(dict.fromkeys([*nearest, *around]))  # those around may be further away
+        ids, keys = zip(*(entries.reference(row)[:2] for row in rows[chosen].tolist()), strict=True)
+        return Place(
+            ids, keys, viewpoints.centres[chosen], viewpoints.axes[chosen], [chosen.index(it) for it in around]
+        )
 
     def surveyed_again(self, scene_key: SceneKey, new_keys: Collection[str], options: AdoptionOptions) -> set[str]:
         """Keys of the surveyed references around which new ones stand."""
         entries = self._entries(scene_key)
         new = list(entries.rows_of_keys(new_keys).values())
-        old = np.setdiff1d(self._surveyed_rows(scene_key, entries), new, assume_unique=True)
+        old = np.setdiff1d(self._surveyed(scene_key, entries)[0], new, assume_unique=True)
         if not len(old):
             return set()
-        centres, axes, found = entries.centres(old), entries.axes(old), set[int]()
+        viewpoints, found = Viewpoints(entries.centres(old), entries.axes(old)), set[int]()
         for centre, axis in zip(entries.centres(np.array(new)), entries.axes(np.array(new)), strict=True):
-            found |= set(rules.nearest_viewpoints(centres, axes, centre, axis, options))
+            found |= set(viewpoints.around(centre, axis, options.places))
         return {entries.reference(int(old[i]))[1] for i in found}
 
     def _entries(self, scene_key: SceneKey) -> Entries:
         context = StageContext(lambda: None)
         return self._engine.references.retrievals[0].indexes.entries(scene_key, context, waits=False)
 
-    def _surveyed_rows(self, scene_key: SceneKey, entries: Entries) -> NDArray[np.intp]:
-        adopted = [it.key for it in adoption.list_adopted(self._store.database, scene_key)]
-        return np.setdiff1d(entries.rows(), list(entries.rows_of_keys(adopted).values()), assume_unique=True)
+    def _surveyed(self, scene_key: SceneKey, entries: Entries) -> tuple[Rows, Viewpoints]:
+        adopted = (it.key for it in adoption.list_adopted(self._store.database, scene_key))
+        return surveyed_viewpoints(entries, adopted)
 
     async def localized(
         self, query: Query, reference_ids: Sequence[str], mask: bytes, *, rerank: bool = True

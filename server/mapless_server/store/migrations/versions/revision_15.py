@@ -11,6 +11,7 @@ def upgrade() -> None:
     """Adds a table, whose rows are deleted with the scenes; servers of revision 14 ignore it."""
     sums = {
         "photograph_count": sa.BigInteger,
+        "support_count": sa.BigInteger,
         "surveyed_share": sa.Double,
         "inlier_count": sa.BigInteger,
         "radius_count": sa.BigInteger,
