@@ -24,7 +24,7 @@ from mapless.results import PlaceState
 from mapless.scene_reports import PeriodCounts, PlaceReport, ReferenceSuggestion, RejectedPosition, SceneReport
 from mapless_tools.cli.app import app
 from mapless_tools.report.drawing import Seen, plan_axes, plan_svg, ring_radius
-from mapless_tools.report.page import report_page
+from mapless_tools.report.page import _shown, report_page
 from mapless_tools.report.places import BAD, FAIR, GOOD, NONE, REASONS, Place, floor_of, floors_of, places_of
 
 CAMERA = Camera(1800, 1350, 1500.0, 1500.0, 899.5, 674.5)
@@ -266,3 +266,11 @@ class TestCommand:
         assert code == 2
         assert error in output
         assert not asked
+
+
+def test_one_wrong_prior_does_not_shrink_the_plan() -> None:
+    far = RejectedPosition(3, (2000.0, 0.0, 1.5), None, 0.1)
+    planted = [place("a", upright(0.0), 5, {"LOW_OVERLAP": 3}), place("b", upright(10.0), 5, {})]
+    given = report(replace(planted[0], rejected_position=far), planted[1])
+    low, high = _shown(given, places_of(given, []), PLAN)
+    assert 10 < high[0] - low[0] < 20
