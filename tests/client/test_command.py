@@ -173,7 +173,7 @@ def test_text_and_json_follow_one_rule(
     ("source", "said"), [("GIVEN", "given"), ("UNSPECIFIED", "unknown"), ("7", "unknown")], ids=["given", "old", "new"]
 )
 def test_only_a_given_pose_is_called_given(source: str, said: str) -> None:
-    assert _pose_of(Provenance(source)) == said
+    assert _pose_of(Provenance(source), "m") == said
 
 
 def test_the_text_of_single_things(run: Run, scene: str) -> None:
