@@ -21,7 +21,6 @@ def upgrade() -> None:
         sa.Column("place_key", sa.String(32), nullable=False),
         sa.Column("usefulness", sa.Double, nullable=False),
         sa.Column("adopt_time_us", sa.BigInteger, nullable=False),
-        sa.Column("adopted_by", sa.Text, nullable=False, server_default=sa.text("''")),
     )
     op.create_index("adopted_reference_by_place", "adopted_reference", ["place_key"])
     op.create_index("adopted_reference_by_adopt_time", "adopted_reference", ["adopt_time_us"])
