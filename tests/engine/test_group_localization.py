@@ -58,7 +58,16 @@ class Toy(QueueEngine):
         stages = {Stage(PREPARE, "host"): compute_items, Stage(JOIN, "host"): compute_items}
         self.queue = WorkQueue(stages, {"host": 2}, options, Observer())
 
-    def query_job(self, query: Query, caller: Caller, source: object = None, on_better: object = None) -> AnyJob:
+    def query_job(
+        self,
+        query: Query,
+        caller: Caller,
+        source: object = None,
+        *,
+        views: object = None,
+        on_better: object = None,
+        gives_way: bool = False,
+    ) -> AnyJob:
         def compute(_: None, check: object) -> None:
             number = next(self._numbers)
             time.sleep(self.seconds)

@@ -20,7 +20,7 @@ from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.security import SceneKey
 from mapless_server.serve import counting
-from mapless_server.services import references
+from mapless_server.services import reports
 from mapless_server.store import adoption, counts
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums
 
@@ -94,7 +94,7 @@ def test_a_scene_made_again_has_no_counts(client: Client) -> None:
 
 def test_a_server_makes_one_report_at_a_time(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """So however many ask, memory is that of one."""
-    make, running, most = references.scene_report, list[int](), list[int]()
+    make, running, most = reports.scene_report, list[int](), list[int]()
 
     def counted(*asked: Any) -> pb.SceneReport:
         running.append(1)
@@ -103,7 +103,7 @@ def test_a_server_makes_one_report_at_a_time(client: Client, scene: str, monkeyp
         running.pop()
         return make(*asked)
 
-    monkeypatch.setattr(references, "scene_report", counted)
+    monkeypatch.setattr("mapless_server.services.references.scene_report", counted)
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda _: client.get_scene_report(scene), range(4)))
     assert most == [1] * 4
