@@ -45,9 +45,11 @@ from mapless_server.store import (
     SceneRecord,
     adoption,
     codec,
+    restoring,
     rows,
 )
 from mapless_server.store.depth_images import decode_depth_image, encode_depth_image
+from mapless_server.store.restoring import Restored
 
 from . import messages
 from .laws import answered, check_pose, check_received_camera
@@ -196,9 +198,6 @@ class WatchfulStore:
         assert [check_id(it) for it in ids] == list(ids)
         return {}
 
-    def restore_reference(self, key: SceneKey, reference_id: str) -> ReferenceRecord:
-        return self.get_reference(key, reference_id)
-
     def list_references(
         self, key: SceneKey, limit: int, after: str, *, only_adopted: bool = False, only_retired: bool = False
     ) -> list[ReferenceRecord]:
@@ -247,10 +246,14 @@ def _retire(store: WatchfulStore, key: SceneKey, reference_id: str) -> Reference
     return store.get_reference(key, reference_id)
 
 
-def _restore(store: WatchfulStore, key: SceneKey, since: datetime | None, place_id: str) -> list[str]:
+def _restore(store: WatchfulStore, key: SceneKey, since: datetime | None, place_id: str) -> Restored:
     check_key(key)
     assert since is None or since.tzinfo is not None
-    return [check_id(place_id)] if place_id else []
+    return Restored([check_id(place_id)] if place_id else [], {})
+
+
+def _restore_reference(store: WatchfulStore, key: SceneKey, reference_id: str) -> ReferenceRecord:
+    return store.get_reference(key, reference_id)
 
 
 def _report(store: WatchfulStore, key: SceneKey, request: pb.GetSceneReportRequest) -> pb.SceneReport:
@@ -261,10 +264,24 @@ def _report(store: WatchfulStore, key: SceneKey, request: pb.GetSceneReportReque
     return pb.SceneReport()
 
 
+def _outdated(service: reference_service.ReferenceService, key: SceneKey) -> dict[str, None]:
+    check_key(key)
+    return {}
+
+
+def _is_adopted(service: reference_service.ReferenceService, key: SceneKey, reference_id: str) -> bool:
+    check_key(key)
+    check_id(reference_id)
+    return False
+
+
 _OF_DATABASES: tuple[tuple[Any, str, Any], ...] = (
     (adoption, "retire_by_operator", _retire),
-    (adoption, "restore", _restore),
+    (restoring, "restore", _restore),
+    (restoring, "restore_reference", _restore_reference),
     (reference_service, "scene_report", _report),
+    (reference_service.ReferenceService, "_outdated_places", _outdated),
+    (reference_service.ReferenceService, "_is_adopted", _is_adopted),
 )
 """Stand-ins for what reads or changes databases beside the store's methods."""
 

@@ -92,6 +92,8 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         """Receives each answer whose call allows adoption; None before the server serves."""
         self.count: Count | None = None
         """Receives the photographs of each answer that is not confidential; None where they are not counted."""
+        self.names_outdated = True
+        """Whether rejections name the place that needs a new survey; the store is read for it."""
 
     async def Localize(self, request: pb.LocalizeRequest, call: Call) -> pb.LocalizeResponse:
         """Implements LocalizationService.Localize."""
@@ -194,7 +196,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
 
     async def _name_outdated(self, response: Any, results: Sequence[Result]) -> None:
         """Says in rejections which place needs a new survey."""
-        if response.WhichOneof("outcome") != "rejection":
+        if response.WhichOneof("outcome") != "rejection" or not self.names_outdated:
             return
         await asyncio.to_thread(name_outdated_place, self._store, response.rejection, results)
 

@@ -212,6 +212,7 @@ def recompute(
     engine = cast(QueueEngine, _Recomputing(call, request, then, references, tiers, options))
     store = cast(Store, ScenesOfCall(call))
     service = LocalizationService(lambda: engine, Metrics(), store, Watchers(False))
+    service.names_outdated = False  # which places needed a new survey is not captured
     now = Call(call.request_id, time.monotonic(), math.inf, Principal(tenant=call.tenant))
     return cast(Response, asyncio.run(getattr(service, call.method)(request, now)))
 
