@@ -19,7 +19,7 @@ LARGEST_M, LARGEST_DEG = 1000.0, 180.0
 MOST_VOUCHERS = 64
 """Surveyed references that vouch for an adopted one."""
 LEAST_EIGENVALUE = -1e-9
-"""Of the correlations of a covariance that is positive semi-definite: rounding."""
+"""Rounding of the correlations of a covariance that is positive semi-definite."""
 _SOURCE: wire.ProtoEnum = pb.PoseSource
 
 

@@ -53,7 +53,7 @@ def policy_of(
 
 
 def policy_text(policy: AdoptionPolicy | None, unit: str) -> str | None:
-    """What a scene with this unit of length adopts, for a person; None if nothing."""
+    """A sentence about the adoption of a scene with this unit of length; None if it adopts nothing."""
     if policy is None:
         return None
     share = f"{100 * policy.min_surveyed_share:.0f} % surveyed"

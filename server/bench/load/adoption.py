@@ -1,4 +1,4 @@
-"""What adoption costs a query: at its answer, and where it comes while another photograph is considered."""
+"""The cost of adoption for a query: at its answer, and where it comes while another photograph is considered."""
 
 import tempfile
 import time

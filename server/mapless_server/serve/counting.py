@@ -43,7 +43,7 @@ MOST_WAITING = 10_000
 """Photographs that wait to be written, some 20 MB."""
 
 Happened = tuple[SceneKey, int, str, int]
-"""What happened in a scene: when, microseconds since 1970, and how often."""
+"""Something that happened in a scene: when, microseconds since 1970, and how often."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +177,7 @@ class Counting(BackgroundObserver):
     def _sums(
         self, scene_key: SceneKey, noted: Sequence[Noted], happened: Sequence[Happened], since_us: int
     ) -> dict[CountKey, Sums]:
-        """What is counted in a scene; what is older is of one that had its id before."""
+        """Counts one thing in a scene; older things are of one that had its id before."""
         found = self._counted(scene_key, [it for it in noted if it.sighting.time_us >= since_us])
         for _, time_us, outcome, amount in happened:
             if time_us >= since_us:

@@ -260,12 +260,12 @@ def _locked_standing(connection: Connection, key: str) -> Row[Any]:
 
 
 def outdated(standing: Standing) -> Standing:
-    """What is known of a place that needs a new survey from now on, by the store's clock."""
+    """The standing of a place that needs a new survey from now on, by the store's clock."""
     return replace(standing, outdate_time_us=rows.now_us())
 
 
 def surveyed_again(standing: Standing) -> Standing:
-    """What is known of a place that has a new survey: nothing of it, yet."""
+    """The standing of a place that has a new survey: nothing is known of it yet."""
     return replace(standing, surveyed_share=None, photograph_count=0, surveyed_by=(), outdate_time_us=None)
 
 

@@ -36,7 +36,7 @@ _HAPPENED = ":"
 
 
 class CountKey(NamedTuple):
-    """What photographs of a scene are counted by: the day since 1970, UTC, the place, empty if unknown, the outcome."""
+    """Key of counts of a scene's photographs: day since 1970, UTC, place, empty if unknown, and outcome."""
 
     day: int
     place_key: str
@@ -125,7 +125,7 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StoredReport:
-    """What is stored of a scene's answers, read at one moment.
+    """The counts that are stored of a scene's answers, read at one moment.
 
     Attributes:
         counts: answered photographs by what they are counted by, in no order.

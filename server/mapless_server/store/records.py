@@ -230,7 +230,7 @@ class RetirementReason(str, Enum):
     SURVEY_OUTDATED = "survey_outdated"
     """Of an adopted one: photographs of its place show too little of what was surveyed."""
     VOUCHERS_GONE = "vouchers_gone"
-    """Of an adopted one: the surveyed references that its pose rests on were deleted or retired."""
+    """The surveyed references that the pose of an adopted one rests on were deleted or retired."""
     BY_OPERATOR = "by_operator"
     """A caller who may change the scene has asked for it."""
 

@@ -28,7 +28,7 @@ MOST_LOST_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Restored:
-    """What became of retired references.
+    """The outcome of restoring retired references.
 
     Attributes:
         reference_ids: of those that are chosen again, ordered.

@@ -73,7 +73,7 @@ def plan_svg(seen: Seen) -> str:
 
 
 def tooltip(place: Place) -> str:
-    """What became of a place's photographs, one line."""
+    """The outcomes of a place's photographs, one line."""
     if not place.photograph_count:
         return f"{place.reference_id}: no photographs"
     why = ", ".join(f"{reason} {count}" for reason, count in place.rejections.items())

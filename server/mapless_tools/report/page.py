@@ -31,14 +31,14 @@ from .places import (
 MOST_ROWS = 300
 """Rows of a table; the plan has all places."""
 _MARGIN = 0.08
-"""Of the plan's extent, around it."""
+"""Margin around the plan, share of its extent."""
 _REACH = 0.5
-"""What is further from all places than this share of their extent is not on the plan: it would become small."""
+"""Things further from all places than this share of their extent are not on the plan: it would become small."""
 
 
 @dataclass(frozen=True)
 class Sign:
-    """What a colour or a shape of the plan means."""
+    """The meaning of a colour or a shape of the plan."""
 
     shape: str
     colour: str
@@ -209,7 +209,7 @@ def _notes(report: SceneReport, scene: Scene, places: Sequence[Place], omitted_c
     if omitted_count:
         notes.append(f"{omitted_count} further references are not drawn.")
     if report.arbitrary_unit:
-        notes.append("Lengths are in the scene's own, arbitrary unit; floors are not told apart.")
+        notes.append("Lengths are in the scene's own, arbitrary unit; floors are not separated.")
     return notes
 
 

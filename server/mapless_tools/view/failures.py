@@ -108,7 +108,7 @@ def rejection_points(places: Sequence[Place], size_m: float) -> tuple[Array, NDA
 
 
 def legend(report: SceneReport) -> str:
-    """What the layer shows, as HTML; the sentences of suggestions by their numbers."""
+    """The content of the layer as HTML; the sentences of suggestions by their numbers."""
     counted = sum(it.photograph_count for it in report.periods)
     if not counted:
         return f"<p>{NOTHING_COUNTED}</p>"

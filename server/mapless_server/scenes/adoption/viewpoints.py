@@ -90,7 +90,7 @@ class Viewpoints:
 
 
 _kept: WeakKeyDictionary[Entries, tuple[Rows, Viewpoints]] = WeakKeyDictionary()
-"""Of each generation of a scene, as long as it is in memory: to make a tree of 100,000 takes 50 ms."""
+"""Trees by generation of a scene, as long as it is in memory: to make one of 100,000 takes 50 ms."""
 
 
 def surveyed_viewpoints(entries: Entries, adopted_keys: Iterable[str]) -> tuple[Rows, Viewpoints]:

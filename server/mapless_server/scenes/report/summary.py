@@ -56,7 +56,7 @@ class Period:
 
     @property
     def means(self) -> tuple[float, float, float]:
-        """Of localized photographs: share of surveyed support, radius (geometric mean), metres, and inliers.
+        """Means over localized photographs: share of surveyed support, radius (geometric), metres, and inliers.
 
         The first and the last are means over those with matches of their own; 0 where unknown.
         """
