@@ -177,7 +177,7 @@ class Counting(BackgroundObserver):
     def _sums(
         self, scene_key: SceneKey, noted: Sequence[Noted], happened: Sequence[Happened], since_us: int
     ) -> dict[CountKey, Sums]:
-        """Counts one thing in a scene; older things are of one that had its id before."""
+        """Sums of a scene's counts since it was made; earlier ones are of another that had its id."""
         found = self._counted(scene_key, [it for it in noted if it.sighting.time_us >= since_us])
         for _, time_us, outcome, amount in happened:
             if time_us >= since_us:
