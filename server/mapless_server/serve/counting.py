@@ -28,6 +28,7 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.scenes.report.counting import Places, Sighting, counted
 from mapless_server.scheduling.processor import give_way, lower_priority
 from mapless_server.security import SceneKey
+from mapless_server.services.localization import Localized
 from mapless_server.services.photographs import question_in
 from mapless_server.store import Store, adoption, counts
 from mapless_server.store.counts import DAY_US, LOCALIZED, CountKey, Sums
@@ -72,7 +73,7 @@ class Counting(BackgroundObserver):
         self._writing: asyncio.Future[None] | None = None
         self._thread = ThreadPoolExecutor(1, "counting", lower_priority, (lambda: engine.queue.prompt_count > 0,))
 
-    def note(self, parts: Sequence[tuple[Query, Result]], outcome: object, localization: object) -> None:
+    def note(self, parts: Sequence[tuple[Query, Result]], outcome: object, localization: Localized | None) -> None:
         """Remembers the photographs of an answer; called on the event loop.
 
         Where a rig or a sequence is localized, all of its photographs are. `localization` is the message of the pose.
@@ -204,11 +205,11 @@ def _giving_way(noted: Sequence[Noted]) -> Iterator[Sighting]:
         yield _with_priors(it)
 
 
-def _localized(result: Result, localization: object) -> Sighting:
+def _localized(result: Result, localization: Localized | None) -> Sighting:
     """A photograph that was localized, alone or with others; its pose is that alone."""
     answer = result.answer
     pose = answer.outcome.world_from_camera if isinstance(answer.outcome, Localization) else None
-    radii = getattr(localization, "accuracy", None)
+    radii = None if localization is None else localization.accuracy
     return Sighting(
         now_us(),
         LOCALIZED,

@@ -61,7 +61,9 @@ GiveBetter = Callable[[pb.LocalizeResponse], None]
 Offer = Callable[[pb.LocalizeOptions, Query, Result, Principal], pb.AdoptionOffer]
 """Receives an answered photograph, which may become a reference, and its caller; returns at once what becomes of it."""
 
-Count = Callable[[Sequence[tuple[Query, Result]], Any, Any], None]
+Localized = pb.Localization | pb.RigLocalization | pb.SequenceLocalization
+
+Count = Callable[[Sequence[tuple[Query, Result]], object, Localized], None]
 """Receives answered photographs, the outcome of their call and the message of its pose, to be counted; at once."""
 
 
@@ -180,7 +182,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             call.note(scene=result.scene_key, searched_scenes=result.searched_scene_count)
         if isinstance(answer.outcome, Localization):
             call.note(pose_stage=answer.outcome.pose_stage.value)
-        await self._name_outdated(response, [result])
+        await self._name_outdated(answer.outcome, response.rejection, [result])
         self._report(answer.outcome, response.localization, [result], call, answer.scale)
         is_watched = result.scene_key in self._watchers.by_scene
         debug = await self._debug_of(answer, request.options.include_debug or is_watched)
@@ -194,11 +196,10 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
             self._watchers.publish(result.scene_key, request, response, debug)
         self._count_photographs(request, [(query, result)], answer.outcome, response.localization)
 
-    async def _name_outdated(self, response: Any, results: Sequence[Result]) -> None:
-        """Says in rejections which place needs a new survey."""
-        if response.WhichOneof("outcome") != "rejection" or not self.names_outdated:
-            return
-        await asyncio.to_thread(name_outdated_place, self._store, response.rejection, results)
+    async def _name_outdated(self, outcome: object, rejection: pb.Rejection, results: Sequence[Result]) -> None:
+        """Sets in the message of a rejection which place needs a new survey; does nothing for other outcomes."""
+        if isinstance(outcome, Rejection) and self.names_outdated:
+            await asyncio.to_thread(name_outdated_place, self._store, rejection, results)
 
     async def _debug_of(self, answer: Answer, is_wanted: bool) -> pb.Debug | None:
         """The evidence behind the pose, if the caller or a watcher of its scene wants it, and there is any."""
@@ -216,7 +217,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         pose = partial(pose_rig, rig_from_camera=rig_from_camera)
         group, outcome = await self._localize_group(queries, call, "images", pose)
         response = rig_to_message(outcome, group, queries, request, session_from_rig)
-        await self._name_outdated(response, group.results)
+        await self._name_outdated(outcome, response.rejection, group.results)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
 
@@ -231,7 +232,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         pose = partial(pose_sequence, session_from_camera=session_from_camera, estimate_scale=scale_is_free)
         group, outcome = await self._localize_group(queries, call, "frames", pose)
         response = sequence_to_message(outcome, group, queries, request, axes)
-        await self._name_outdated(response, group.results)
+        await self._name_outdated(outcome, response.rejection, group.results)
         self._finish_group(request, response, outcome, queries, group.results, call)
         return response
 
@@ -322,7 +323,7 @@ class LocalizationService(rpcs.LocalizationServiceServicer):
         self._count_photographs(request, parts, outcome, response.localization)
 
     def _count_photographs(
-        self, request: Request, parts: Sequence[tuple[Query, Result]], outcome: object, localization: Any
+        self, request: Request, parts: Sequence[tuple[Query, Result]], outcome: object, localization: Localized
     ) -> None:
         if self.count is not None and not request.options.confidential:
             self.count(parts, outcome, localization)
