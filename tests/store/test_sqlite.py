@@ -4,6 +4,8 @@ import logging
 import os
 import sqlite3
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -92,6 +94,21 @@ class TestOpening:
         store.delete_reference(OFFICE, "a") if what == "reference" else store.delete_scene(OFFICE)
         store.close()  # which empties the journal
         assert found() == 0
+
+    def test_closing_waits_for_threads_that_read(self, data_dir: Path) -> None:
+        store, reads = Store.open(data_dir), threading.Event()
+
+        def read() -> None:
+            with store.database.read():
+                reads.set()
+                time.sleep(0.2)
+
+        with ThreadPoolExecutor(1) as thread:
+            reading = thread.submit(read)
+            assert reads.wait(10)
+            store.close()
+            assert not list(data_dir.glob("*.sqlite3-*"))  # else it is removed beneath whatever opens the folder next
+            reading.result()
 
     def test_transactions_really_begin(self, store: Store, data_dir: Path) -> None:
         with store.database.write() as writer:

@@ -11,6 +11,7 @@ import importlib
 import logging
 import os
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum, auto
@@ -21,6 +22,7 @@ from urllib.parse import quote
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, select
 from sqlalchemy.exc import DBAPIError
+from sqlalchemy.pool import QueuePool
 
 from mapless_server.errors import FailedPrecondition, RequestError, Unavailable
 
@@ -41,9 +43,12 @@ FREE_SPACE_TIMEOUT_MS = 100
 """Waiting for readers of the journal; a backup reads for longer, and is not waited for."""
 JOURNAL_KEPT_BYTES = 8 * 2**20
 """A journal that a large change has made longer is truncated when it is restarted. Deleting needs less."""
+CLOSING_S = 10.0
+"""How long closing waits for threads that read or write; whatever reads for longer closes its connection itself."""
 SPACE_TO_OPEN_BYTES = 64 * 1024
 """Free space that SQLite needs beside the file to open it."""
 
+_POLL_S = 0.01
 _URI_PREFIX = "file:"
 _BEGIN_OPTION = "sqlite_begin_statement"
 
@@ -267,7 +272,16 @@ class SqliteDatabase:
             self.free_space()
 
     def close(self) -> None:
-        """Closes all connections and unlocks the folder; nothing may be reading or writing."""
+        """Closes all connections, once other threads have given back theirs, and unlocks the folder.
+
+        A task of the server that is cancelled leaves its thread to end by itself. Were its connection closed after the
+        others, SQLite's journal would vanish beneath whatever opens the folder next.
+        """
+        pool = self._engine.pool
+        assert isinstance(pool, QueuePool)
+        end_s = time.monotonic() + CLOSING_S
+        while pool.checkedout() and time.monotonic() < end_s:
+            time.sleep(_POLL_S)
         self._engine.dispose()
         if self._folder_lock is not None:
             self._folder_lock.release()
