@@ -20,6 +20,7 @@ SOURCES = {
     "mapless_tools": "server",
     "mapless_ray": "deploy/ray",
     "bench": "server",
+    "research": "server",
 }
 LADDER = (
     "serve",
@@ -135,8 +136,9 @@ def test_imports_between_rooms_go_downward() -> None:
 @pytest.mark.parametrize(
     ("below", "above"),
     [
-        (("mapless", "mapless_server"), ("mapless_tools", "mapless_ray", "bench")),
-        (("mapless_tools", "mapless_ray"), ("bench",)),  # which is not installed
+        (("mapless", "mapless_server"), ("mapless_tools", "mapless_ray", "bench", "research")),
+        (("mapless_tools", "mapless_ray"), ("bench", "research")),  # which are not installed
+        (("bench",), ("research",)),
     ],
 )
 def test_what_is_below_imports_nothing_above(below: tuple[str, ...], above: tuple[str, ...]) -> None:
@@ -150,7 +152,7 @@ def test_what_is_below_imports_nothing_above(below: tuple[str, ...], above: tupl
 
 
 def test_no_module_is_in_a_circle_of_imports() -> None:
-    TopologicalSorter(graph("mapless", "mapless_server", "mapless_tools", "bench", deferred=True)).prepare()
+    TopologicalSorter(graph(*SOURCES, deferred=True)).prepare()
 
 
 def test_no_room_inside_method_is_in_a_circle() -> None:

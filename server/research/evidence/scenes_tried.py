@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bench.groups import Asked, Folder, folders_of, is_right_answer, store_folders
 from mapless_server.engine import scene_group
 from mapless_server.engine.options import EngineOptions
 from mapless_server.method.judge.answer import Localization
@@ -18,6 +17,7 @@ from mapless_server.serve.assembly import engine_over
 from mapless_server.serve.features import make_tiers
 from mapless_server.settings import load_settings
 from mapless_server.store import Store
+from research.groups import Asked, Folder, folders_of, is_right_answer, store_folders
 
 from ..places import Scenes
 from .page import Measurement, Row

@@ -1,4 +1,4 @@
-"""`python -m bench.groups DATA`: photographs are looked for among all scenes of a folder, as with their scene named.
+"""`python -m research.groups DATA`: photographs are looked for among all scenes of a folder, as with their scene named.
 
 Of each folder some photographs are left out, which are then asked with their scene named, and among all scenes; and
 among the scenes of other places only, where none must be localized. Of 200 scenes, those of the folders and others
