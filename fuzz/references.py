@@ -249,7 +249,7 @@ def _retire(store: WatchfulStore, key: SceneKey, reference_id: str) -> Reference
 def _restore(store: WatchfulStore, key: SceneKey, since: datetime | None, place_id: str) -> Restored:
     check_key(key)
     assert since is None or since.tzinfo is not None
-    return Restored([check_id(place_id)] if place_id else [], {})
+    return Restored([check_id(place_id)] if place_id else [], {"old": "its place needs a new survey"})
 
 
 def _restore_reference(store: WatchfulStore, key: SceneKey, reference_id: str) -> ReferenceRecord:

@@ -71,7 +71,7 @@ from .options import ConnectOptions
 from .priors import GeoPositionPrior, GravityPrior, HeadingPrior, PosePrior, PositionPrior, Priors
 from .provenance import Provenance, Voucher
 from .requests import IntrinsicsUncertainty, NewReference, ReadoutDirection
-from .results import Coverage, PendingWork, Reference, ReferenceAudit, RetrievedReference, Scene
+from .results import Coverage, PendingWork, Reference, ReferenceAudit, RestoredReferences, RetrievedReference, Scene
 from .scenes import UNCHANGED, AdoptionPolicy, Calibration
 from .shortcut import localize
 from .used_intrinsics import IntrinsicsCheck, UsedIntrinsics
@@ -134,6 +134,7 @@ __all__ = [
     "ReferenceUse",
     "Rejected",
     "ResourceExhausted",
+    "RestoredReferences",
     "RetrievedReference",
     "RigImage",
     "RigLocalization",

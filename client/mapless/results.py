@@ -133,6 +133,20 @@ class Reference:
     place: PlaceState | None = None
 
 
+@dataclass(frozen=True)
+class RestoredReferences:
+    """The outcome of restoring retired references.
+
+    Attributes:
+        reference_ids: those that are chosen for photographs again, ordered.
+        still_retired: why others stay retired, one sentence each by id: adopted ones without what vouches for them, at
+            places that need a new survey, or that their places have no room for.
+    """
+
+    reference_ids: tuple[str, ...]
+    still_retired: Mapping[str, str]
+
+
 @dataclass(frozen=True, eq=False)
 class RetrievedReference:
     """A reference similar to a photograph: its name, cosine similarity (-1 to 1) and pose."""

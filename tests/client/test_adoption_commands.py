@@ -17,6 +17,7 @@ from mapless import (
     NewReference,
     PermissionDenied,
     Provenance,
+    RestoredReferences,
     Voucher,
 )
 from mapless_server.security import SceneKey, create_token
@@ -85,6 +86,18 @@ def test_a_reference_is_retired_and_restored_by_command(run: Run, client: Client
     assert (code, text.splitlines()) == (0, ["1 reference chosen for photographs again", "  r1"])
     assert "1 reference" in run("reference", "restore", scene, "--all")[1]
     assert list(client.list_references(scene, only_retired=True)) == []
+
+
+def test_references_that_stay_retired_are_named_with_why(run: Run, client: Client, scene: str) -> None:
+    client.add_reference(scene, NewReference("new", PHOTO, CAMERA, pose(5.0), provenance=ADOPTED))
+    run("reference", "retire", scene, "r0")  # which vouches for more than half
+    later = datetime.now(timezone.utc)
+    for it in ("r2", "new"):
+        run("reference", "retire", scene, it)
+    code, text, _ = run("reference", "restore", scene, "--since", later.isoformat())
+    lines = ["1 reference chosen for photographs again", "  r2", "1 reference still retired"]
+    assert (code, text.splitlines()) == (0, [*lines, "  new: what vouches for it was deleted or is retired"])
+    assert client.restore_references(scene) == RestoredReferences(("new", "r0"), {})
 
 
 def test_a_place_is_that_of_a_surveyed_reference(run: Run, client: Client, scene: str) -> None:

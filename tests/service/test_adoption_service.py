@@ -7,7 +7,17 @@ import pytest
 from support.servers import CAMERA, PHOTO, RunningServer, Stubs, failure_of, pose
 from support.waiting import wait_until
 
-from mapless import Accuracy, AdoptionPolicy, Client, InvalidArgument, NewReference, NotFound, Provenance, Voucher
+from mapless import (
+    Accuracy,
+    AdoptionPolicy,
+    Client,
+    InvalidArgument,
+    NewReference,
+    NotFound,
+    Provenance,
+    RestoredReferences,
+    Voucher,
+)
 from mapless.results import PlaceState
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
@@ -139,10 +149,10 @@ def test_a_reference_is_retired_by_hand_and_all_restored(client: Client, scene: 
     client.retire_reference(scene, "r2")
     audits = {it.name.rpartition("/")[2]: it.verdict for it in client.audit_scene(scene)}
     assert (audits["r1"], audits["r2"]) == ("RETIRED", "RETIRED")
-    assert client.restore_references(scene, place="r1") == ["r1"]
+    assert client.restore_references(scene, place="r1") == RestoredReferences(("r1",), {})
     assert [it.reference_id for it in client.list_references(scene, only_retired=True)] == ["r2"]
-    assert client.restore_references(scene, since=datetime.now(timezone.utc) + timedelta(minutes=5)) == []
-    assert client.restore_references(scene) == ["r2"]
+    assert client.restore_references(scene, since=datetime.now(timezone.utc) + timedelta(minutes=5)).reference_ids == ()
+    assert client.restore_references(scene).reference_ids == ("r2",)
     with pytest.raises(ValueError, match="time zone"):
         client.restore_references(scene, since=datetime(2026, 11, 29))
 

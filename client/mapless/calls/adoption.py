@@ -9,7 +9,7 @@ from ..connection import Connection
 from ..errors import NotFound
 from ..messages import reference_from_message
 from ..names import parse_reference_name, reference_name, scene_name
-from ..results import Reference
+from ..results import Reference, RestoredReferences
 from ..v1 import reference_service_pb2 as pb
 from .references import delete_reference, list_references
 
@@ -32,8 +32,8 @@ async def restore_references(
     since: datetime | None = None,
     place: str = "",
     timeout_s: float | None = None,
-) -> list[str]:
-    """Has the retired references of a scene chosen again, as one change; returns their ids, ordered.
+) -> RestoredReferences:
+    """Has the retired references of a scene chosen again, as one change, but those that would not last.
 
     Args:
         scene: the scene.
@@ -45,11 +45,14 @@ async def restore_references(
     if since is not None:
         _check_zone(since)
         wire.set_time(request.since, since, "since")
-    return await connection.call("RestoreReferences", request, _ids, timeout_s)
+    return await connection.call("RestoreReferences", request, _restored, timeout_s)
 
 
-def _ids(response: Any) -> list[str]:
-    return [parse_reference_name(it)[1] for it in response.references]
+def _restored(response: Any) -> RestoredReferences:
+    return RestoredReferences(
+        tuple(parse_reference_name(it)[1] for it in response.references),
+        {parse_reference_name(it.name)[1]: it.reason for it in response.still_retired},
+    )
 
 
 async def restore_reference(

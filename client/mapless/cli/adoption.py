@@ -111,13 +111,20 @@ def restore_references(client: Client, arguments: argparse.Namespace) -> int:
     if len(given) > 1 and given != narrowing:
         raise ValueError(f"{given[0]} does not go together with {' and '.join(given[1:])}")
     if not arguments.reference:
-        ids = client.restore_references(arguments.scene, since=arguments.since, place=arguments.place)
-        number = f"{len(ids)} reference{'' if len(ids) == 1 else 's'} chosen for photographs again"
-        return show(arguments, ids, [number, *(f"  {it}" for it in ids)])
+        done = client.restore_references(arguments.scene, since=arguments.since, place=arguments.place)
+        ids, still = done.reference_ids, done.still_retired
+        lines = [f"{_number(len(ids))} chosen for photographs again", *(f"  {it}" for it in ids)]
+        if still:
+            lines += [f"{_number(len(still))} still retired", *(f"  {it}: {why}" for it, why in still.items())]
+        return show(arguments, done, lines)
     was_retired = client.get_reference(arguments.scene, arguments.reference).retire_time is not None
     found = client.restore_reference(arguments.scene, arguments.reference)
     text = "is chosen for photographs again" if was_retired else "was not retired"
     return show(arguments, found, [f"{found.reference_id} {text}"])
+
+
+def _number(count: int, what: str = "reference") -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def undo_adoption(client: Client, arguments: argparse.Namespace) -> int:
@@ -125,8 +132,8 @@ def undo_adoption(client: Client, arguments: argparse.Namespace) -> int:
     if not is_confirmed(arguments, f"delete what {arguments.scene} has adopted since {arguments.since.isoformat()}"):
         return EXIT_FAILED
     gone = client.undo_adoption(arguments.scene, arguments.since)
-    number = f"{len(gone)} adopted reference{'' if len(gone) == 1 else 's'} deleted"
-    return show(arguments, gone, [number, *(f"  {it.reference_id}" for it in gone)])
+    number = _number(len(gone), "adopted reference")
+    return show(arguments, gone, [f"{number} deleted", *(f"  {it.reference_id}" for it in gone)])
 
 
 def adopted_table(references: list[Reference]) -> list[str]:

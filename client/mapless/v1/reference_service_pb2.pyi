@@ -438,10 +438,20 @@ class RestoreReferencesRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., since: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., place: _Optional[str] = ...) -> None: ...
 
 class RestoreReferencesResponse(_message.Message):
-    __slots__ = ("references",)
+    __slots__ = ("references", "still_retired")
     REFERENCES_FIELD_NUMBER: _ClassVar[int]
+    STILL_RETIRED_FIELD_NUMBER: _ClassVar[int]
     references: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, references: _Optional[_Iterable[str]] = ...) -> None: ...
+    still_retired: _containers.RepeatedCompositeFieldContainer[StillRetired]
+    def __init__(self, references: _Optional[_Iterable[str]] = ..., still_retired: _Optional[_Iterable[_Union[StillRetired, _Mapping]]] = ...) -> None: ...
+
+class StillRetired(_message.Message):
+    __slots__ = ("name", "reason")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    reason: str
+    def __init__(self, name: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
 
 class RestoreReferenceRequest(_message.Message):
     __slots__ = ("name",)

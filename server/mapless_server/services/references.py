@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -59,6 +58,7 @@ from .messages.references import (
     reference_to_message,
     require_radius,
     restored_from_message,
+    restored_to_message,
     retired_to_message,
     scene_to_message,
 )
@@ -69,8 +69,6 @@ if TYPE_CHECKING:  # services do not load what computes
     from mapless_server.engine.queue_engine import QueueEngine
     from mapless_server.scenes import ReferenceAudit
     from mapless_server.scenes.agreement import Agreement
-
-log = logging.getLogger(__name__)
 
 MAX_BATCH = 1000
 MAX_RETRIEVED = 1000
@@ -328,10 +326,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         if place_id != "" and await self._stored(self._is_adopted, scene_key, place_id):
             raise FieldError("place", f"{names.shown(place_id)} was adopted: name the surveyed reference of its place")
         restored = await self._stored(restoring.restore, self._store, scene_key, since, place_id)
-        for reference_id, why in restored.staying.items():
-            log.warning("%s of scene %s stays retired: %s", reference_id, scene_key, why)
-        made = [names.reference_name(scene_id_of(scene_key), it) for it in restored.reference_ids]
-        return pb.RestoreReferencesResponse(references=made)
+        return restored_to_message(scene_id_of(scene_key), restored.reference_ids, restored.staying)
 
     def _is_adopted(self, scene_key: SceneKey, reference_id: str) -> bool:
         from mapless_server.store import adoption

@@ -197,6 +197,18 @@ def restored_from_message(request: pb.RestoreReferencesRequest, scene_id: str) -
     return since, reference_id
 
 
+def restored_to_message(
+    scene_id: str, reference_ids: Sequence[str], staying: Mapping[str, str]
+) -> pb.RestoreReferencesResponse:
+    """Message of the ids of references that are chosen again, and why others stay retired, by id."""
+    return pb.RestoreReferencesResponse(
+        references=[names.reference_name(scene_id, it) for it in reference_ids],
+        still_retired=[
+            pb.StillRetired(name=names.reference_name(scene_id, it), reason=why) for it, why in staying.items()
+        ],
+    )
+
+
 MUCH_IGNORED = 0.8
 """A mask that ignores a larger share of a reference is most likely inverted."""
 
