@@ -55,6 +55,19 @@ def test_errors_of_references_are_below_no_radius() -> None:
         assert after.position_68_m == pytest.approx(math.hypot(2 * radius_m, 0.01), rel=1e-2)
 
 
+@pytest.mark.parametrize("share", [0.3, 2.0])
+def test_what_adopted_references_are_off_is_not_scaled(share: float) -> None:
+    attributes, theirs = SceneAttributes(self_calibrations=(own(),)), share * COVARIANCE
+    before = accuracy_from_covariance(COVARIANCE)
+    found = reported_radii(before, COVARIANCE, SIFT, KIND, attributes, USUAL_GAP, theirs)
+    kept = min(share, 1.0)
+    scale = np.repeat([2.0, 0.5], 3)
+    scaled = scale[:, None] * COVARIANCE * scale
+    np.testing.assert_allclose(found.covariance, (1 - kept) * scaled + kept * COVARIANCE, atol=1e-9)
+    expected_m = math.sqrt(4 * (1 - kept) + kept) * before.position_68_m
+    assert found.accuracy.position_68_m == pytest.approx(expected_m, rel=1e-3)
+
+
 def test_measured_ones_win_over_those_of_references() -> None:
     both = SceneAttributes(calibration=MEASURED, self_calibrations=(own(),))
     after = reported_radii(Accuracy(1.0, 2.0, 3.0, 4.0), COVARIANCE, SIFT, KIND, both, 0.3)

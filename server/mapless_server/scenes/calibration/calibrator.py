@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import closing, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, islice, zip_longest
 
@@ -64,6 +64,31 @@ REFERENCE_COUNT, SHORTLIST = 10, 20
 """References that each is localized with, and those of which they are chosen; as for queries by default."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Surveyed:
+    """The references of a scene whose poses are independent of one another's: all that were not adopted.
+
+    Attributes:
+        scene_key: the scene.
+        entries: its references in use, of one generation.
+        ids: those that were not adopted; empty if none was.
+        library: with their features.
+    """
+
+    scene_key: SceneKey
+    entries: Entries
+    ids: Collection[str]
+    library: ReferenceLibrary
+
+    @classmethod
+    def of(
+        cls, scene_key: SceneKey, entries: Entries, adopted: Collection[str], library: ReferenceLibrary
+    ) -> "_Surveyed":
+        """The references of a scene without the `adopted`, given by id."""
+        ids = (entries.reference(row)[0] for row in entries.rows().tolist()) if adopted else ()
+        return cls(scene_key, entries, [it for it in ids if it not in adopted], library)
+
+
 class Calibrator:
     """Calibrates scenes for the answers of one tier."""
 
@@ -94,35 +119,33 @@ class Calibrator:
     ) -> SelfCalibration:
         """Localizes so many references of a scene, and fits the model to the results.
 
-        `newest` are ids of its latest references, the latest first; none of the `adopted` is localized, since their
-        poses were computed from the others. `pause` is called between the stages of each, and may raise, which ends it.
+        `newest` are ids of its latest references, the latest first. Those of the `adopted` are left out on both sides:
+        their poses were computed from the others, which would localize them, and be localized by them, too well.
+        `pause` is called between the stages of each, and may raise, which ends it.
         Of fewer than `LENS_REFERENCES` no errors of the lens are sought. In a scene that
         `contradicts_itself` none are localized: its poses measure nothing.
         NotFound if there is no such scene (field "scene").
         """
         context = StageContext(pause)
         entries = self._indexes.entries(scene_key, context)
-        sample = [] if contradicts_itself else self._sample(entries, newest, count, adopted)
+        surveyed = _Surveyed.of(scene_key, entries, adopted, library)
+        sample = [] if contradicts_itself else self._sample(surveyed, newest, count)
         shared: list[SharedErrors] = []
         # Few references show errors of a lens that more of them do not.
-        results = self._localize(
-            scene_key, entries, library, sample, context, shared if count >= LENS_REFERENCES else None
-        )
+        results = self._localize(surveyed, sample, context, shared if count >= LENS_REFERENCES else None)
         found, lens = fit(results, self.kind, entries.generation), lens_contradiction(shared)
         if lens is None:
             return found
         log.warning("scene %s: %s", scene_key, lens)
         # With the same wrong lens references agree with one another. Photographs with the right one are off by more, or
         # rejected, so that nothing is known of them.
-        results = self._localize(scene_key, entries, library, sample, context, lens=lens)
+        results = self._localize(surveyed, sample, context, lens=lens)
         right = fit(results, self.kind, entries.generation)
         return replace(right if right.answer_count else found, lens=str(lens))
 
     def _localize(
         self,
-        scene_key: SceneKey,
-        entries: Entries,
-        library: ReferenceLibrary,
+        surveyed: _Surveyed,
         sample: Sequence[str],
         context: StageContext,
         shared: list[SharedErrors] | None = None,
@@ -130,47 +153,51 @@ class Calibrator:
     ) -> list[LeftOut]:
         """Localizes each of a sample against the others, without errors `lens`; appends what it shows to `shared`."""
         begin_s, results = time.thread_time(), []
-        most_s = self._max_cpu_s * max(1, -(-len(entries) // 1000))
+        most_s = self._max_cpu_s * max(1, -(-len(surveyed.entries) // 1000))
         for reference_id in sample:
             if time.thread_time() - begin_s > most_s:
                 break
-            result = self._leave_out(scene_key, entries, library, reference_id, context, shared, lens)
+            result = self._leave_out(surveyed, reference_id, context, shared, lens)
             if result is not None:
                 results.append(result)
             context.check()
         return results
 
-    def _sample(self, entries: Entries, newest: Sequence[str], count: int, adopted: Collection[str]) -> list[str]:
+    def _sample(self, surveyed: _Surveyed, newest: Sequence[str], count: int) -> list[str]:
         """Ids of so many references to leave out: the newest and the worst covered by turns."""
-        rows = entries.rows()
+        entries, rows = surveyed.entries, surveyed.entries.rows(surveyed.ids or None)
         if len(rows) < LEAST_REFERENCES:
             return []
         centres = entries.centres(rows)
         nearest_m = KDTree(centres).query(centres, k=2)[0][:, 1]
         by_distance = (entries.reference(rows[i])[0] for i in np.argsort(-nearest_m, kind="stable"))
-        far = list(islice((it for it in by_distance if it not in adopted), count))
-        by_turns = chain.from_iterable(zip_longest([it for it in newest if it in entries], far))
+        known_newest = [it for it in newest if it in entries]
+        by_turns = chain.from_iterable(zip_longest(known_newest, islice(by_distance, count)))
         return [it for it in dict.fromkeys(by_turns) if it is not None][:count]
 
     def _leave_out(
         self,
-        scene_key: SceneKey,
-        entries: Entries,
-        library: ReferenceLibrary,
+        surveyed: _Surveyed,
         reference_id: str,
         context: StageContext,
         shared: list[SharedErrors] | None,
         lens: SharedErrors | None,
     ) -> LeftOut | None:
         """Localizes one reference; None if it has too few others, or is deleted or damaged."""
-        load = partial(self._indexes.load_existing, library, scene_key, extractor=self._extractor, context=context)
+        load = partial(
+            self._indexes.load_existing,
+            surveyed.library,
+            surveyed.scene_key,
+            extractor=self._extractor,
+            context=context,
+        )
         loaded = load(reference_ids=[reference_id])
         if not loaded:
             return None
         (subject,) = loaded
         if lens is not None:
             subject = without_errors(subject, lens)
-        wanted = [it.reference_id for it in rank_beside(entries, reference_id, SHORTLIST)]
+        wanted = [it.reference_id for it in rank_beside(surveyed.entries, reference_id, SHORTLIST, surveyed.ids)]
         others = [it for it in load(reference_ids=wanted) if not _is_copy(it, subject)]
         if len(others) < 2:
             return None

@@ -182,10 +182,14 @@ def _similar(entries: Entries, narrowing: Narrowing, vector: Vector, count: int)
     return entries.similarities(vector, rows) if entries.is_exact else entries.similar(vector, rows, count).similarity
 
 
-def rank_beside(entries: Entries, reference_id: str, count: int) -> list[RankedReference]:
-    """The other references that a query from the place of one of the entries would choose, in the order of choice."""
+def rank_beside(entries: Entries, reference_id: str, count: int, among: Collection[str] = ()) -> list[RankedReference]:
+    """The other references that a query from the place of one of the entries would choose, in the order of choice.
+
+    `among` are ids of the candidates; empty for the whole scene.
+    """
     (row,) = entries.rows([reference_id])
-    ranked = rank_references(entries, entries.vector(row), Selection(count + 1, options=THINNED_LATER))
+    selection = Selection(count + 1, among=among, options=THINNED_LATER)
+    ranked = rank_references(entries, entries.vector(row), selection)
     return [it for it in ranked if it.reference_id != reference_id]
 
 

@@ -105,8 +105,11 @@ def radii_of(result: Result, options: LocalizeOptions, covariance: Array) -> Rep
     """The reported radii of the pose of a result, by its covariance (6, 6)."""
     accuracy, support = accuracy_from_covariance(covariance), result.answer.support
     conditions = Conditions(result.tier.features, result.tier.backend, options.variant.name, __version__)
-    gap = viewpoint_gap(support)[0] if isinstance(support, PosedSupport) else None
-    return reported_radii(accuracy, covariance, conditions, result.tier.kind, result.attributes, gap)
+    kind, attributes = result.tier.kind, result.attributes
+    if not isinstance(support, PosedSupport):
+        return reported_radii(accuracy, covariance, conditions, kind, attributes, None)
+    gap, by_references = viewpoint_gap(support)[0], support.estimate.reference_covariance
+    return reported_radii(accuracy, covariance, conditions, kind, attributes, gap, by_references)
 
 
 def _localization_to_message(

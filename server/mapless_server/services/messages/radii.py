@@ -8,7 +8,7 @@ import numpy as np
 
 from mapless.geometry import Array
 from mapless.scenes import MAX_FACTOR, MIN_FACTOR, Calibration
-from mapless_server.method.bundle.estimate import USUAL_GAP, Accuracy, growth
+from mapless_server.method.bundle.estimate import USUAL_GAP, Accuracy, accuracy_from_covariance, growth
 from mapless_server.method.options import Variant
 from mapless_server.store import SceneAttributes, SelfCalibration
 
@@ -97,8 +97,17 @@ def reported_radii(
     kind: str,
     attributes: SceneAttributes,
     gap: float | None,
+    by_references: Array | None = None,
 ) -> ReportedRadii:
     """Radii by the scene's measured calibration, else by its self-calibration, if made under the same conditions.
+
+    Factors are of errors that surveyed references lead to. Those of adopted references are reported with these, so that
+    their part of the covariance is added as it is:
+
+        C' = D (C - R) D + R,    D = diag(fp, fp, fp, fr, fr, fr),
+
+    and the squares of the radii likewise. Priors may have made C smaller than R: then it is as large a share of R as C
+    contains.
 
     Args:
         accuracy: radii of the method.
@@ -107,6 +116,7 @@ def reported_radii(
         kind: kind of the answer, see `store.calibration_kind`; with depths kept with references another one.
         attributes: attributes of the scene.
         gap: gap of the answer, see `method.bundle.estimate.viewpoint_gap`; None if unknown.
+        by_references: R (6, 6), the part of the covariance by what adopted references are off in common; None without.
     """
     used, source = attributes.calibration, "MEASURED"
     if used is None or not used.is_of(*astuple(conditions)):
@@ -116,9 +126,24 @@ def reported_radii(
         used, source = calibration_of(own, conditions), "SELF"
     if gap is None and used.grows_with_gap:
         return ReportedRadii(accuracy, covariance)
+    if by_references is not None:
+        by_references = by_references * _contained_share(by_references, covariance)
+        covariance = covariance - by_references
+        accuracy = accuracy_from_covariance(covariance)
     factors = Factors.of(used, accuracy, USUAL_GAP if gap is None else gap)
-    scaled = scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors)
-    return ReportedRadii(*scaled, source, used.query_count)
+    accuracy, covariance = scaled_accuracy(accuracy, factors), scaled_covariance(covariance, factors)
+    if by_references is not None:
+        covariance = covariance + by_references
+        theirs = astuple(accuracy_from_covariance(by_references))
+        accuracy = Accuracy(*map(math.hypot, astuple(accuracy), theirs))
+    return ReportedRadii(accuracy, covariance, source, used.query_count)
+
+
+def _contained_share(part: Array, covariance: Array) -> float:
+    """Largest share, at most 1, of a covariance (6, 6) that another one, of full rank, contains."""
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    largest = float(np.linalg.eigvalsh(whiten @ part @ whiten.T)[-1])
+    return min(1.0, 1.0 / max(largest, sys.float_info.min))
 
 
 def _factor(factor: float, noise: float, radius: float) -> float:
