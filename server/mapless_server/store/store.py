@@ -26,7 +26,6 @@ from . import deletion, queries, rows, tables
 from .database import DamagedPages, Database, with_room_to_delete
 from .deletion import PendingDeletions
 from .depth_images import encode_depth_image
-from .postgresql import PostgresqlDatabase
 from .reader import NAME_CACHE_BYTES, NO_LABELS, StoreReader, observed
 from .records import (
     DescribedReference,
@@ -83,6 +82,8 @@ class Store(StoreReader):
         if the database cannot be reached or used, with one sentence that says why, without the password; ValueError if
         `cache_bytes` is negative.
         """
+        from .postgresql import PostgresqlDatabase  # most stores are folders
+
         described: LruCache[DescribedReference] = LruCache(cache_bytes)
         return Store._resumed(PostgresqlDatabase.open(database_url), described)
 
