@@ -17,15 +17,7 @@ the conversion between values and messages, report/ the HTML report of an answer
 """
 
 from . import aio
-from .answers import (
-    Accuracy,
-    FramedPose,
-    Hint,
-    Hypothesis,
-    LocalizationResult,
-    PriorCheck,
-    Rejected,
-)
+from .answers import Accuracy, FramedPose, Hint, Hypothesis, LocalizationResult, PriorCheck, Rejected
 from .cameras import read_camera, read_cameras, read_pose
 from .client import Client
 from .depth import DepthImage, DepthNoise, DepthSensor, IgnoredDepth

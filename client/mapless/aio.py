@@ -13,7 +13,7 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, TypeVar
 
-from .calls import adoption, health, localization, references, reports
+from .calls import adoption, groups, health, localization, references, reports, scenes
 from .connection import IN_FLIGHT, Connection, ItemT
 from .errors import MaplessError
 from .options import ConnectOptions
@@ -61,14 +61,14 @@ class Client(Connection):
 
     localize = localization.localize
     localize_progressively = localization.localize_progressively
-    localize_rig = localization.localize_rig
-    localize_sequence = localization.localize_sequence
+    localize_rig = groups.localize_rig
+    localize_sequence = groups.localize_sequence
 
-    create_scene = references.create_scene
-    get_scene = references.get_scene
-    update_scene = references.update_scene
-    list_scenes = references.list_scenes
-    delete_scene = references.delete_scene
+    create_scene = scenes.create_scene
+    get_scene = scenes.get_scene
+    update_scene = scenes.update_scene
+    list_scenes = scenes.list_scenes
+    delete_scene = scenes.delete_scene
 
     add_reference = references.add_reference
     add_references = references.add_references

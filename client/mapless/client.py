@@ -10,7 +10,7 @@ from functools import wraps
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from .calls import adoption, health, localization, references, reports
+from .calls import adoption, groups, health, localization, references, reports, scenes
 from .connection import IN_FLIGHT, Connection, ItemT
 from .errors import MaplessError
 from .options import ConnectOptions
@@ -97,14 +97,14 @@ class Client(Connection):
 
     localize = _blocking(localization.localize)
     localize_progressively = _iterated(localization.localize_progressively)
-    localize_rig = _blocking(localization.localize_rig)
-    localize_sequence = _blocking(localization.localize_sequence)
+    localize_rig = _blocking(groups.localize_rig)
+    localize_sequence = _blocking(groups.localize_sequence)
 
-    create_scene = _blocking(references.create_scene)
-    get_scene = _blocking(references.get_scene)
-    update_scene = _blocking(references.update_scene)
-    list_scenes = _iterated(references.list_scenes)
-    delete_scene = _blocking(references.delete_scene)
+    create_scene = _blocking(scenes.create_scene)
+    get_scene = _blocking(scenes.get_scene)
+    update_scene = _blocking(scenes.update_scene)
+    list_scenes = _iterated(scenes.list_scenes)
+    delete_scene = _blocking(scenes.delete_scene)
 
     add_reference = _blocking(references.add_reference)
     add_references = _blocking(references.add_references)

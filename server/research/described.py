@@ -21,7 +21,7 @@ from mapless_server.method.features.views import PosedView, View
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.method.pipeline import Pipeline
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.plan import evenly_spread

@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from support.clients import Played
 
 from mapless import wire
-from mapless.calls import localization, references, repeats
+from mapless.calls import groups, localization, references, repeats, scenes
 from mapless.connection import Connection
 from mapless.depth import DepthImage, IgnoredDepth
 from mapless.errors import AlreadyExists, Internal, NotFound, Unavailable
@@ -44,7 +44,7 @@ def created(there: Any, generation: int = 1) -> Any:
 
 
 def create(connection: Connection) -> Any:
-    return references.create_scene(connection, "hall", datum=DATUM, down_in_world=DOWN)
+    return scenes.create_scene(connection, "hall", datum=DATUM, down_in_world=DOWN)
 
 
 def sent() -> pb.CreateSceneRequest:
@@ -233,14 +233,14 @@ def localize(connection: Connection) -> Any:
         (localize, of_35_covariances),
         (localize, of_unequal_columns),
         (localize, before_the_calendar),
-        (lambda it: localization.localize_rig(it, [], "a"), of_a_rig),
+        (lambda it: groups.localize_rig(it, [], "a"), of_a_rig),
         (
             lambda it: references.retrieve_references(it, b"photo", CAMERA, "a"),
             lambda: pb.RetrieveReferencesResponse(references=[pb.RetrievedReference()]),
         ),
-        (lambda it: references.get_scene(it, "a"), pb.GetSceneResponse),
+        (lambda it: scenes.get_scene(it, "a"), pb.GetSceneResponse),
         (lambda it: references.get_reference(it, "a", "b"), pb.GetReferenceResponse),
-        (lambda it: anext(references.list_scenes(it)), lambda: pb.ListScenesResponse(scenes=[pb.Scene()])),
+        (lambda it: anext(scenes.list_scenes(it)), lambda: pb.ListScenesResponse(scenes=[pb.Scene()])),
     ],
 )
 def test_an_answer_that_breaks_its_contract_is_a_server_error(

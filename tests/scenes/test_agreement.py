@@ -11,7 +11,7 @@ import pytest
 from support.waiting import wait_until
 
 from mapless_server.method.features.extractors import SiftExtractor
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.scenes import scene_agreements
 from mapless_server.scenes.agreement import Agreement, agreement_of
 from mapless_server.scenes.explaining import SamePose

@@ -10,7 +10,7 @@ from support.programs import printed
 from mapless_command.installation import how_to_install
 from mapless_server.extras import install_hint
 from mapless_server.method.features.extractors import edgepoint2, make_extractor
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.method.pairs.pair import Matching
 from mapless_server.networks.weights import WeightsMissing
 from mapless_server.observability.metrics import Metrics

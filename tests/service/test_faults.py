@@ -51,7 +51,7 @@ from mapless.geometry import Camera
 from mapless.v1 import reference_service_pb2 as reference_pb
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.rpc import receiving
-from mapless_server.serve import running as grpc_server
+from mapless_server.serve import listening
 
 ONCE = ConnectOptions(max_attempts=1)
 SERVING, NOT_SERVING = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
@@ -107,7 +107,7 @@ class TestClients:
     def test_callers_that_never_send_block_no_other(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Open methods take no token, so these callers are unknown; a tenth of the real numbers."""
         for module, name in (
-            (grpc_server, "MAX_CONCURRENT_RPCS"),
+            (listening, "MAX_CONCURRENT_RPCS"),
             (receiving, "MAX_OPEN_WAITING"),
             (receiving, "MAX_OPEN_STREAMS"),
         ):

@@ -31,7 +31,7 @@ from mapless import (
     SequenceLocalization,
 )
 from mapless.axes import Axes, pose_to
-from mapless.calls import localization
+from mapless.calls import groups
 from mapless.geometry import rotation_from_vector
 from mapless.messages import sequence_from_message
 
@@ -132,7 +132,7 @@ def test_soft_priors_of_another_place_do_not_cost_the_answer(corner: Client, que
 def test_a_sequence(corner: Client, queries: list[bytes], axes: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The device's tracked poses, in its own axes and its own unit."""
     parse = Mock(wraps=sequence_from_message)
-    monkeypatch.setattr(localization, "sequence_from_message", parse)
+    monkeypatch.setattr(groups, "sequence_from_message", parse)
     name = Axes(axes or "opencv")
     session_from_world = RigidTransform(rotation_from_vector([0.1, -0.3, 0.2]), np.array([3.0, 1.0, -2.0]))
 

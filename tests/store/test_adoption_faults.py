@@ -78,8 +78,8 @@ import os, sys
 from pathlib import Path
 sys.path[:0] = sys.argv[2:]
 from support.adopted import HALL, adopt, adopted
-from mapless_server.store import Store, adoption, queries
-queries.note_removals = lambda *_: os._exit(9)  # after the least useful one was deleted
+from mapless_server.store import Store, adoption, changes
+changes.note_removals = lambda *_: os._exit(9)  # after the least useful one was deleted
 adopt(Store.open(Path(sys.argv[1])), adopted("y", 0.9), 1)
 """
 

@@ -204,7 +204,7 @@ def test_following_is_reading_whole(
 def test_a_reader_behind_the_kept_deletions_reads_all(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tombstones do not pile up; whether remembered or not, following is reading whole."""
     remembered = 4
-    monkeypatch.setattr("mapless_server.store.queries.GENERATIONS_REMEMBERED", remembered)
+    monkeypatch.setattr("mapless_server.store.changes.GENERATIONS_REMEMBERED", remembered)
     with place.open() as store:
         store.create_scene(OFFICE)
         store.add_references(OFFICE, [make_reference(f"r{it}", it, count=1) for it in range(12)])

@@ -1,4 +1,4 @@
-"""Localization of one photograph, of a rig's photographs, and of a sequence."""
+"""Localization of one photograph."""
 
 import warnings
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
@@ -14,8 +14,8 @@ from ..axes import Axes
 from ..connection import Connection
 from ..depth import DepthImage, IgnoredDepth, depth_to_message
 from ..geometry import Camera, RigidTransform
-from ..groups import GroupRejected, ImageReport, RigImage, RigLocalization, SequenceFrame, SequenceLocalization
-from ..messages import answer_from_message, rig_from_message, sequence_from_message
+from ..groups import ImageReport
+from ..messages import answer_from_message
 from ..names import reference_names, scene_name, shown
 from ..priors import Priors, set_priors
 from ..requests import ImageSource, IntrinsicsUncertainty, read_image, read_mask
@@ -23,7 +23,6 @@ from ..v1 import localization_service_pb2 as pb
 
 P = ParamSpec("P")
 T = TypeVar("T")
-M = TypeVar("M", pb.RigImage, pb.SequenceFrame)
 
 
 async def _localize_request(
@@ -108,7 +107,7 @@ async def _localize_request(
         mask=await connection.unblocked(read_mask, mask),
         intrinsics=None if camera is None else wire.camera_to_message(camera),
         depth=None if depth is None else depth_to_message(depth),
-        options=_options_to_message(
+        options=options_to_message(
             variant=wire.enum_value(pb.Variant, variant),
             scale_strategy=wire.enum_value(pb.ScaleStrategy, scale_strategy),
             reference_count=reference_count,
@@ -125,14 +124,14 @@ async def _localize_request(
     )
     if with_datum and group is None:
         raise ValueError("with_datum needs group: the labels of the scenes, {} for all")
-    _set_scenes(request, scene, scenes, group, prior_scene)
+    set_scenes(request, scene, scenes, group, prior_scene)
     if with_datum:
         request.scene_group.with_datum = True
     if references:
         request.references.extend(reference_names(scene, references))
     set_priors(request, priors or Priors())
     if intrinsics_uncertainty is not None:
-        uncertainty = _uncertainty_to_message(intrinsics_uncertainty, "intrinsics_uncertainty")
+        uncertainty = uncertainty_to_message(intrinsics_uncertainty, "intrinsics_uncertainty")
         request.intrinsics_uncertainty.CopyFrom(uncertainty)
     if capture_time is not None:
         wire.set_time(request.capture_time, capture_time, "capture_time")
@@ -141,7 +140,7 @@ async def _localize_request(
     return request
 
 
-def _set_scenes(
+def set_scenes(
     request: pb.LocalizeRequest | pb.LocalizeRigRequest | pb.LocalizeSequenceRequest,
     scene: str,
     scenes: Sequence[str],
@@ -196,7 +195,7 @@ async def localize(  # noqa: D103, it has the docstring of the request
 ) -> LocalizationResult | Rejected:
     request = await _localize_request(connection, *asked, **named)
     answer = await connection.call("Localize", request, answer_from_message, named.get("timeout_s"))
-    _check_depths([request], [answer])
+    check_depths([request], [answer])
     return answer
 
 
@@ -220,7 +219,7 @@ async def localize_progressively(
     async with aclosing(connection.streamed("LocalizeProgressively", request, _streamed, timeout_s)) as answers:
         async for answer in answers:
             if answer.is_final:
-                _check_depths([request], [answer])
+                check_depths([request], [answer])
             yield answer
 
 
@@ -233,126 +232,7 @@ def _streamed(message: pb.LocalizeProgressivelyResponse) -> LocalizationResult |
     return replace(answer, is_final=False)
 
 
-async def localize_rig(
-    connection: Connection,
-    images: Sequence[RigImage],
-    scene: str = "",
-    *,
-    scenes: Sequence[str] = (),
-    group: Mapping[str, str] | None = None,
-    prior_scene: str = "",
-    reference_count: int = 0,
-    coverage: float = 0.0,
-    confidential: bool = False,
-    allow_adoption: bool = False,
-    include_imprecise_pose: bool = False,
-    capture_time: datetime | None = None,
-    session_from_rig: RigidTransform | None = None,
-    timeout_s: float | None = None,
-) -> RigLocalization | GroupRejected:
-    """Localizes a rig from photographs that its cameras took at the same moment.
-
-    One pose is estimated from all photographs together, which can succeed where each photograph alone fails.
-
-    Args:
-        images: the photographs, 1 to 8.
-        scene: the scene to localize in. Exactly one of this, `scenes` and `group` is required.
-        scenes, group: where the server finds the scene by the photographs, which must name no references; see
-            `localize`.
-        prior_scene: see `localize`; for the priors of all photographs.
-        reference_count: number of references that the server chooses for each photograph; 0 for its default.
-        coverage: see `localize`; holds for the joint pose, and for each photograph alone.
-        confidential: see `localize`.
-        allow_adoption: see `localize`; concerns photographs that are localized alone, see `ImageReport.diagnostics`.
-        include_imprecise_pose: see `localize`; concerns `ImageReport.hypotheses_alone`.
-        capture_time: time of the photographs, with time zone; returned with the answer.
-        session_from_rig: the device's own pose of the rig at that time, OpenCV's axes; used for
-            `RigLocalization.world_from_session`.
-        timeout_s: deadline of the call.
-    """
-    request = pb.LocalizeRigRequest(
-        images=[
-            await connection.unblocked(_rig_image_to_message, image, scene, field)
-            for field, image in wire.listed(images, RigImage, "images")
-        ],
-        options=_options_to_message(
-            reference_count=reference_count,
-            coverage=coverage,
-            confidential=confidential,
-            allow_adoption=allow_adoption,
-            include_imprecise_pose=include_imprecise_pose,
-        ),
-    )
-    _set_scenes(request, scene, scenes, group, prior_scene)
-    if capture_time is not None:
-        wire.set_time(request.capture_time, capture_time, "capture_time")
-    if session_from_rig is not None:
-        request.session_from_rig.CopyFrom(wire.transform_to_message(session_from_rig, "session_from_rig"))
-    answer = await connection.call("LocalizeRig", request, rig_from_message, timeout_s)
-    _check_depths(request.images, answer.images)
-    return answer
-
-
-async def localize_sequence(
-    connection: Connection,
-    frames: Sequence[SequenceFrame],
-    scene: str = "",
-    *,
-    scenes: Sequence[str] = (),
-    group: Mapping[str, str] | None = None,
-    prior_scene: str = "",
-    estimate_session_scale: bool = False,
-    reference_count: int = 0,
-    coverage: float = 0.0,
-    confidential: bool = False,
-    allow_adoption: bool = False,
-    include_imprecise_pose: bool = False,
-    axes: Axes | str = "",
-    timeout_s: float | None = None,
-) -> SequenceLocalization | GroupRejected:
-    """Localizes a device from a few photographs and the poses that it tracked meanwhile, which may drift or jump.
-
-    Where the photographs contradict the tracking, the sequence is cut, and the photographs after the cut are localized
-    without the earlier ones (`SequenceLocalization.jumps`).
-
-    Args:
-        frames: 2 to 16 photographs with the device's poses, the oldest first.
-        scene: the scene to localize in. Exactly one of this, `scenes` and `group` is required.
-        scenes, group: where the server finds the scene by the photographs, which must name no references; see
-            `localize`.
-        prior_scene: see `localize`; for the priors of all photographs.
-        estimate_session_scale: whether the scale of the device's poses is unknown; the device must have moved.
-        reference_count: number of references that the server chooses for each photograph; 0 for its default.
-        coverage: see `localize`; holds for the joint pose, and for each photograph alone.
-        confidential: see `localize`.
-        allow_adoption: see `localize`; concerns photographs that are localized alone, see `ImageReport.diagnostics`.
-        include_imprecise_pose: see `localize`; concerns `ImageReport.hypotheses_alone`.
-        axes: "opencv" (default), "arkit", "arcore", "unity", "ros", or one of `Axes`: the axes of the device's poses
-            and of `SequenceLocalization.world_from_session`.
-        timeout_s: deadline of the call.
-    """
-    request = pb.LocalizeSequenceRequest(
-        frames=[
-            await connection.unblocked(_frame_to_message, frame, scene, field)
-            for field, frame in wire.listed(frames, SequenceFrame, "frames")
-        ],
-        options=_options_to_message(
-            reference_count=reference_count,
-            coverage=coverage,
-            confidential=confidential,
-            allow_adoption=allow_adoption,
-            include_imprecise_pose=include_imprecise_pose,
-            axes=wire.enum_value(pb.Axes, axes),
-        ),
-    )
-    _set_scenes(request, scene, scenes, group, prior_scene)
-    wire.set_numbers(request, {"estimate_session_scale": estimate_session_scale})
-    answer = await connection.call("LocalizeSequence", request, sequence_from_message, timeout_s)
-    _check_depths(request.frames, answer.images)
-    return answer
-
-
-def _check_depths(
+def check_depths(
     requests: Sequence[Any],
     answers: Sequence[LocalizationResult | Rejected | ImageReport],
 ) -> None:
@@ -362,45 +242,15 @@ def _check_depths(
         warnings.warn(IgnoredDepth("photographs"), stacklevel=2)
 
 
-def _uncertainty_to_message(uncertainty: IntrinsicsUncertainty, field: str) -> pb.IntrinsicsUncertainty:
+def uncertainty_to_message(uncertainty: IntrinsicsUncertainty, field: str) -> pb.IntrinsicsUncertainty:
+    """Converts; errors name the field."""
     wire.require(uncertainty, IntrinsicsUncertainty, field, "such as IntrinsicsUncertainty(focal_sigma_px=20)")
     direction = wire.enum_value(pb.ReadoutDirection, uncertainty.readout_direction)
     return pb.IntrinsicsUncertainty(**{**asdict(uncertainty), "readout_direction": direction})
 
 
-def _options_to_message(**values: Any) -> pb.LocalizeOptions:
+def options_to_message(**values: Any) -> pb.LocalizeOptions:
+    """The options with these values, by their fields' names."""
     options = pb.LocalizeOptions()
     wire.set_numbers(options, values)
     return options
-
-
-def _photograph_to_message(message: M, given: RigImage | SequenceFrame, scene: str, field: str) -> M:
-    """Sets what the photographs of rigs and of sequences have in common; reads the file. Errors name the field."""
-    message.image = read_image(given.image, f"{field}.image")
-    mask = read_mask(given.mask, f"{field}.mask")
-    if mask is not None:
-        message.mask = mask
-    if given.depth is not None:
-        message.depth.CopyFrom(depth_to_message(given.depth, f"{field}.depth"))
-    if given.camera is not None:
-        message.intrinsics.CopyFrom(wire.camera_to_message(given.camera, f"{field}.camera"))
-    if given.intrinsics_uncertainty is not None:
-        uncertainty = _uncertainty_to_message(given.intrinsics_uncertainty, f"{field}.intrinsics_uncertainty")
-        message.intrinsics_uncertainty.CopyFrom(uncertainty)
-    if given.references:
-        message.references.extend(reference_names(scene, given.references))
-    set_priors(message, given.priors, f"{field}.priors")
-    return message
-
-
-def _rig_image_to_message(image: RigImage, scene: str, field: str) -> pb.RigImage:
-    pose = wire.transform_to_message(image.rig_from_camera, f"{field}.rig_from_camera")
-    return _photograph_to_message(pb.RigImage(rig_from_camera=pose), image, scene, field)
-
-
-def _frame_to_message(frame: SequenceFrame, scene: str, field: str) -> pb.SequenceFrame:
-    pose = wire.transform_to_message(frame.session_from_camera, f"{field}.session_from_camera")
-    message = pb.SequenceFrame(session_from_camera=pose)
-    if frame.capture_time is not None:
-        wire.set_time(message.capture_time, frame.capture_time, f"{field}.capture_time")
-    return _photograph_to_message(message, frame, scene, field)

@@ -49,7 +49,7 @@ _LAST_BYTES_S = 5.0
 
 
 class Ingress:
-    """Receives the calls of a replica; one a process. Implements `mapless_server.serve.running.Listener`.
+    """Receives the calls of a replica; one a process. Implements `mapless_server.serve.listening.Listener`.
 
     The address is unknown, since Serve chooses and opens the port when the replica is ready.
     """

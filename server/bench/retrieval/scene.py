@@ -14,7 +14,7 @@ from mapless.provenance import GIVEN_POSE
 from mapless_server.method.features.views import Features, View
 from mapless_server.scenes.retrieval.quantizing import quantized
 from mapless_server.security import SceneKey
-from mapless_server.store import NewReference, Store, queries, rows
+from mapless_server.store import NewReference, Store, changes, rows
 from mapless_server.store.codec import encode_geometry, sha256_for
 
 from .vectors import Floats, Vectors
@@ -95,7 +95,7 @@ def _add(store: Store, first: int, vectors: Floats) -> None:
     """Adds references (N, D) without photographs and features, which retrieval does not read."""
     described = [(uuid.uuid4().hex, vector) for vector in vectors]
     with store.changing() as connection:
-        generation = queries.begin_change(connection, SCENE, len(vectors))
+        generation = changes.begin_change(connection, SCENE, len(vectors))
         of_references = []
         for number, (key, _) in enumerate(described, first):
             geometry = _geometry(*_place(number))

@@ -16,6 +16,7 @@ from mapless_server.engine.photo_views import QueryViews, RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import DataLoss
 from mapless_server.images import upright_of
+from mapless_server.method.features.limits import EPIPOLAR_PX
 from mapless_server.method.features.rolls import (
     LEAST_AGREEMENT,
     Similarity,
@@ -27,9 +28,11 @@ from mapless_server.method.features.rolls import (
     roll_of_rotation,
     similarity_of,
 )
-from mapless_server.method.features.views import PosedView
+from mapless_server.method.features.views import PosedView, View
 from mapless_server.method.judge.decide import PLACES
 from mapless_server.method.judge.hypothesis import Found, Hypothesis, Raster, Where
+from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.epipolar import epipolar_distance_px
 from mapless_server.method.promise import PROMISE
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.scenes import Choice, Narrowing, Selection
@@ -38,7 +41,6 @@ from mapless_server.scenes.retrieval.ranking import THINNED_LATER, spread_choice
 from mapless_server.scheduling import Abandoned, Failure
 from mapless_server.store import SceneAttributes, SceneState
 
-from . import tracking
 from .failures import SceneMadeAnew, failure_of
 from .query import MIRROR, Tier
 from .search import Search
@@ -54,6 +56,13 @@ SAMPLED = 5
 
 LEAST_DESCRIBED = 2
 """An attempt is made with so many references at least where others still lack its features."""
+
+OTHERS = 2
+"""References elsewhere that are compared."""
+
+RIVAL_SHARE = 0.5
+"""A reference elsewhere contradicts a pose by so many matches off their epipolar lines, as a share of the matches with
+the best reference; as in `judge.judge`."""
 
 ALONE_BY_CHANCE = LEAST_AGREEMENT - PROMISE.agreement
 """Difference of the agreement of one reference and of two where both are as likely by chance."""
@@ -260,8 +269,17 @@ def _is_contradicted_elsewhere(search: Search, found: Hypothesis, tier: Tier) ->
     if not others or others[0][1] > 0:
         return False
     with search.context.stage("correspond"):
-        rivals = load_chosen(search, [name for name, _ in others[: tracking.OTHERS]], tier)[1]
-        return tracking.is_contradicted(found, material.view, rivals, tier.pipeline.matcher)
+        rivals = load_chosen(search, [name for name, _ in others[:OTHERS]], tier)[1]
+        return is_contradicted(found, material.view, rivals, tier.pipeline.matcher)
+
+
+def is_contradicted(found: Found, view: View, others: Sequence[PosedView], matcher: Matcher) -> bool:
+    """Whether other references share much with the photograph that does not fit the pose of a hypothesis."""
+    assert isinstance(found, Hypothesis)
+    posed = PosedView("", "", view, found.world_from_camera)
+    many = RIVAL_SHARE * max(found.answer.reference_match_counts)
+    matches = zip(others, matcher.match_quickly(view, others), strict=True)
+    return any((epipolar_distance_px(posed, it, pairs) >= EPIPOLAR_PX).sum() >= many for it, pairs in matches)
 
 
 def _is_same_anywhere(search: Search, tier: Tier) -> bool:

@@ -11,46 +11,26 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from mapless_server.engine.photo_views import RasterForm
 from mapless_server.engine.search import Material
 from mapless_server.errors import NotFound, RequestError, Unavailable
 from mapless_server.method import ladder, pipeline
 from mapless_server.method.bundle.estimate import Support
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.decide import decide
-from mapless_server.method.judge.hypothesis import (
-    AS_IT_IS,
-    Attempt,
-    Doubt,
-    Found,
-    Hypothesis,
-    Raster,
-    Solver,
-    Where,
-    found_by,
-)
+from mapless_server.method.judge.hypothesis import AS_IT_IS, Attempt, Doubt, Found, Raster, Solver, Where, found_by
 from mapless_server.method.options import DoubtOptions, Variant
 from mapless_server.method.pipeline import Coarse, Prepared, tracked_support
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.method.solve import solve
-from mapless_server.scenes import Selection
 from mapless_server.scenes.library import FeaturesMissing
-from mapless_server.scheduling import (
-    Abandoned,
-    Done,
-    Ending,
-    Failure,
-    Fallback,
-    Next,
-    Step,
-    processor_s,
-)
+from mapless_server.scheduling import Abandoned, Done, Ending, Failure, Fallback, Next, Step, processor_s
 
-from . import among, cameras, choosing, cutting, tracking
+from . import among, cameras, choosing, cutting
 from .failures import failure_of
 from .query import COARSE, PREPARE, REFINE, TRACK, CutReason, LadderCut, Result, Tier
 from .search import DOUBTFUL, SKIPPED, Search, SearchJob, SearchResult, SearchStep
 from .situation import any_roll_of, situation_of
+from .tracking import track
 from .verdicts import Verdicts
 
 log = logging.getLogger(__name__)
@@ -297,51 +277,13 @@ class QueryStages:
     def _tracked(self, search: Search) -> SearchResult:
         """Answers from the references near the pose prior if that leaves no doubt; else the search begins."""
         seconds, begin_s = search.context.stage_seconds, time.monotonic()
-        tracked = self._track(search)
+        tracked = track(search, self._verdicts)
         if tracked is not None:
             return self._conclude(*tracked)
         kept = {name: seconds[name] for name in ("describe", "decode") if name in seconds}  # the search does not repeat
         seconds.clear()
         seconds |= {TRACK: time.monotonic() - begin_s - sum(kept.values())} | kept
         return self._skipped(search, DOUBTFUL)
-
-    def _track(self, search: Search) -> tuple[Search, Found] | None:
-        query, context, prior = search.query, search.context, search.query.priors.pose
-        assert prior is not None
-        with context.stage(TRACK):
-            selection = Selection(min(tracking.REFERENCES, query.reference_count), near=prior)
-            near = search.source.choose(query.scene_key, search.views, selection, context)
-        if len(near.references) < 2:
-            return None
-        tier, views = (
-            self._verdicts.tier(search.attempt),
-            search.views.in_form(RasterForm(max_pixels=tracking.MAX_PIXELS)),
-        )
-        scene, references = choosing.load_chosen(search, [it.reference_id for it in near.references], tier)
-        view, matcher = views.view(tier.extractor, context), tier.pipeline.matcher
-        with context.stage("correspond"):
-            matches = tuple(matcher.match_quickly(view, references, context.check))
-        attributes = choosing.attributes_of(search, scene)
-        material = Material(search.attempt.basis, views, view, references, scene, attributes, near, matches)
-        search = search.but(material=material)
-        given = view, references, self._verdicts.pipeline(search, tier)
-        prepared = pipeline.prepare(*given, query.options, context, matches, query.priors)
-        if isinstance(prepared, Rejection):
-            return None
-        (coarse,) = pipeline.reconstruct([prepared])
-        if isinstance(coarse, Exception):
-            raise coarse
-        doubt = self._verdicts.doubt_in(search)
-        found = self._verdicts.within_limits(search, solve(coarse, search.attempt, doubt))
-        if not isinstance(found, Hypothesis) or tracking.doubts_of_tracked(found, doubt):
-            return None
-        selection = Selection(query.reference_count, query.narrowing.limits)
-        alike = search.source.choose(query.scene_key, views, selection, context)
-        others = [it.reference_id for it in tracking.elsewhere(near, alike)]
-        with context.stage(TRACK):
-            rivals = choosing.load_chosen(search, others, tier)[1] if others else ()
-            is_contradicted = tracking.is_contradicted(found, view, rivals, matcher)
-        return None if is_contradicted else (search, found)
 
     def _reconstructed(self, search: Search, coarse: Coarse | Exception) -> SearchResult:
         if isinstance(coarse, Exception):

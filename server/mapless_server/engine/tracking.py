@@ -13,42 +13,29 @@ references elsewhere that resemble the photograph, wherever the prior is, must n
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
+from mapless_server.engine.photo_views import RasterForm
+from mapless_server.engine.search import Material
+from mapless_server.method import pipeline
 from mapless_server.method.bundle.estimate import PosedSupport
-from mapless_server.method.coarse.geometric import GeometricReconstructor
-from mapless_server.method.features.limits import EPIPOLAR_PX
-from mapless_server.method.features.views import PosedView, View
 from mapless_server.method.judge.hypothesis import Doubt, Found, Hypothesis
 from mapless_server.method.options import DoubtOptions
-from mapless_server.method.pairs.correspond import Matcher
-from mapless_server.method.pairs.epipolar import epipolar_distance_px
-from mapless_server.scenes import Choice, RankedReference
+from mapless_server.method.rejection import Rejection
+from mapless_server.method.solve import solve
+from mapless_server.scenes import Choice, RankedReference, Selection
 
-from .query import Tier
+from . import choosing
+from .query import TRACK
+from .search import Search
+from .verdicts import Verdicts
 
 MAX_PIXELS = 384 * 288
 """Size of the reduced photograph, for less processor time. Evidence: tracking."""
 
 REFERENCES = 8
 """Largest number of references near the prior. Evidence: tracking."""
-
-OTHERS = 2
-"""References elsewhere that are compared."""
-
-RIVAL_SHARE = 0.5
-"""A reference elsewhere contradicts a pose by so many matches off their epipolar lines, as a share of the matches with
-the best reference; as in `judge.judge`."""
-
-_GEOMETRIC = GeometricReconstructor()
-
-
-def tracking_tier(tier: Tier) -> Tier:
-    """The tier with the backend that triangulates."""
-    return replace(tier, pipeline=replace(tier.pipeline, reconstructor=_GEOMETRIC))
 
 
 def doubts_of_tracked(found: Hypothesis, options: DoubtOptions) -> Doubt:
@@ -71,13 +58,41 @@ def elsewhere(near: Choice, alike: Choice) -> list[RankedReference]:
     centres = np.stack([it.world_from_camera.translation for it in near.references])
     extent_m = float(np.linalg.norm(centres - centres[0], axis=1).max())
     far = [it for it in alike.references if math.dist(it.world_from_camera.translation, centres[0]) > extent_m]
-    return far[:OTHERS]
+    return far[: choosing.OTHERS]
 
 
-def is_contradicted(found: Found, view: View, others: Sequence[PosedView], matcher: Matcher) -> bool:
-    """Whether other references share much with the photograph that does not fit the pose of a hypothesis."""
-    assert isinstance(found, Hypothesis)
-    posed = PosedView("", "", view, found.world_from_camera)
-    many = RIVAL_SHARE * max(found.answer.reference_match_counts)
-    matches = zip(others, matcher.match_quickly(view, others), strict=True)
-    return any((epipolar_distance_px(posed, it, pairs) >= EPIPOLAR_PX).sum() >= many for it, pairs in matches)
+def track(search: Search, verdicts: Verdicts) -> tuple[Search, Found] | None:
+    """Localizes a photograph by the references near its pose prior, see above; None if that leaves any doubt."""
+    query, context, prior = search.query, search.context, search.query.priors.pose
+    assert prior is not None
+    with context.stage(TRACK):
+        selection = Selection(min(REFERENCES, query.reference_count), near=prior)
+        near = search.source.choose(query.scene_key, search.views, selection, context)
+    if len(near.references) < 2:
+        return None
+    tier, views = verdicts.tier(search.attempt), search.views.in_form(RasterForm(max_pixels=MAX_PIXELS))
+    scene, references = choosing.load_chosen(search, [it.reference_id for it in near.references], tier)
+    view, matcher = views.view(tier.extractor, context), tier.pipeline.matcher
+    with context.stage("correspond"):
+        matches = tuple(matcher.match_quickly(view, references, context.check))
+    attributes = choosing.attributes_of(search, scene)
+    material = Material(search.attempt.basis, views, view, references, scene, attributes, near, matches)
+    search = search.but(material=material)
+    given = view, references, verdicts.pipeline(search, tier)
+    prepared = pipeline.prepare(*given, query.options, context, matches, query.priors)
+    if isinstance(prepared, Rejection):
+        return None
+    (coarse,) = pipeline.reconstruct([prepared])
+    if isinstance(coarse, Exception):
+        raise coarse
+    doubt = verdicts.doubt_in(search)
+    found = verdicts.within_limits(search, solve(coarse, search.attempt, doubt))
+    if not isinstance(found, Hypothesis) or doubts_of_tracked(found, doubt):
+        return None
+    selection = Selection(query.reference_count, query.narrowing.limits)
+    alike = search.source.choose(query.scene_key, views, selection, context)
+    others = [it.reference_id for it in elsewhere(near, alike)]
+    with context.stage(TRACK):
+        rivals = choosing.load_chosen(search, others, tier)[1] if others else ()
+        is_contradicted = choosing.is_contradicted(found, view, rivals, matcher)
+    return None if is_contradicted else (search, found)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from mapless_server.engine.search import Material
 from mapless_server.method import ladder
 from mapless_server.method.bundle.estimate import PosedSupport
+from mapless_server.method.coarse.geometric import GeometricReconstructor
 from mapless_server.method.judge.answer import Answer, Localization
 from mapless_server.method.judge.hints import hinted
 from mapless_server.method.judge.hypothesis import Attempt, Doubt, Found, Where
@@ -16,9 +17,10 @@ from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.scenes import ANYWHERE, Choice
 
-from . import tracking
 from .query import TRYING, CutReason, LadderCut, Result, Tier, Tried
 from .search import UNFINISHED, Search
+
+_GEOMETRIC = GeometricReconstructor()
 
 
 class Verdicts:
@@ -31,7 +33,7 @@ class Verdicts:
     def tier(self, attempt: Attempt) -> Tier:
         """The features and backend of an attempt."""
         tier = self._tiers[attempt.features]
-        return tracking.tracking_tier(tier) if attempt.where is Where.NEAR_PRIOR else tier
+        return _that_triangulates(tier) if attempt.where is Where.NEAR_PRIOR else tier
 
     def doubt_in(self, search: Search) -> DoubtOptions:
         """Adapts the options to the scene's quantiles of trust, so that the same answers are doubtful in all scenes."""
@@ -147,3 +149,7 @@ def _with_unfinished(answer: Answer, attempts: Sequence[Tried], cuts: Sequence[L
 
 def _rejected(found: Found, rejection: Rejection, doubts: Doubt) -> Found:
     return replace(found, answer=replace(found.answer, outcome=rejection), doubts=doubts)
+
+
+def _that_triangulates(tier: Tier) -> Tier:
+    return replace(tier, pipeline=replace(tier.pipeline, reconstructor=_GEOMETRIC))

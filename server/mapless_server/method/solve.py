@@ -16,16 +16,10 @@ from .bundle.pose_problem import AdjustInput
 from .bundle.shutter import StillView, row_times, still_view, with_motion, without_motion
 from .features.views import DepthSource, Matches, PosedView, Reconstruction
 from .judge.answer import Answer, Localization
-from .judge.cameras import intrinsics_checks
 from .judge.evidence import Votes, votes_of
 from .judge.hypothesis import Attempt, Doubt, Found, Solver, doubt_of, found_by
-from .judge.judge import (
-    contradiction,
-    judge,
-    one_reference_failure,
-    one_reference_radius_failure,
-    trust_of_score,
-)
+from .judge.intrinsics import intrinsics_checks
+from .judge.judge import contradiction, judge, one_reference_failure, one_reference_radius_failure, trust_of_score
 from .judge.references import unmoved_failure
 from .judge.two_view import (
     lacks_distance,

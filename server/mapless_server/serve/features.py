@@ -18,7 +18,8 @@ from mapless_server.method.features.extractors import FeatureExtractor, make_ext
 from mapless_server.method.features.extractors.options import ALIKED_VARIANT, LearnedOptions
 from mapless_server.method.features.lightglue_options import CPU_OPTIONS
 from mapless_server.method.features.matching import OPTIONS
-from mapless_server.method.pairs.correspond import Matcher, make_light_glue, make_matcher
+from mapless_server.method.pairs.correspond import Matcher
+from mapless_server.method.pairs.make import make_light_glue, make_matcher
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.networks.weights import CATALOGUE, WeightsMissing, find_weights, named
 from mapless_server.networks.weights.folder import Status, look_up

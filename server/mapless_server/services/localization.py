@@ -12,12 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapless.v1 import localization_service_pb2 as pb
 from mapless.v1 import localization_service_pb2_grpc as rpcs
-from mapless_server.engine.groups import (
-    MAX_FRAMES,
-    MAX_RIG_IMAGES,
-    MIN_FRAMES,
-    GroupResult,
-)
+from mapless_server.engine.groups import MAX_FRAMES, MAX_RIG_IMAGES, MIN_FRAMES, GroupResult
 from mapless_server.engine.query import TRACK, Query, Result
 from mapless_server.errors import RequestError
 from mapless_server.method.judge.answer import Answer, Localization

@@ -7,39 +7,26 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from mapless import names, wire
 from mapless.depth import depth_to_message
-from mapless.geometry import MAX_COORDINATE_M, RigidTransform
-from mapless.provenance import Provenance
+from mapless.geometry import MAX_COORDINATE_M
 from mapless.v1 import reference_service_pb2 as pb
 from mapless.v1 import reference_service_pb2_grpc as rpcs
 from mapless.wire import FieldError
 from mapless_server.engine.failures import SceneMadeAnew
-from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Photo
-from mapless_server.errors import AlreadyExists, DataLoss, NotFound
+from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT
+from mapless_server.errors import AlreadyExists
 from mapless_server.rpc import Call
 from mapless_server.scenes import Viewpoint
 from mapless_server.security import NOWHERE, SceneKey, key_of, scene_id_of, tenant_of
-from mapless_server.store import (
-    ContradictingDown,
-    DatumWithoutMetres,
-    NewReference,
-    ReferenceRecord,
-    SceneAttributes,
-    SceneRecord,
-    Store,
-    WrongRadius,
-)
+from mapless_server.store import ContradictingDown, DatumWithoutMetres, SceneAttributes, Store, WrongRadius
 
+from .adding import Adding, contradictions
 from .messages.enums import message_of
 from .messages.priors import priors_from_message
-from .messages.queries import (
-    photo_from_message,
-    reference_ids_from_names,
-    with_depth,
-)
+from .messages.queries import photo_from_message, reference_ids_from_names
 from .messages.references import (
     MOST_NAMED,
     Page,
@@ -48,12 +35,9 @@ from .messages.references import (
     audit_to_message,
     changes_from_message,
     choice_to_message,
-    implausible_depths,
     kept_adopted,
     labels_from_message,
     named_place,
-    nearly_ignored,
-    new_provenance,
     outdated_places,
     reference_to_message,
     require_radius,
@@ -73,22 +57,11 @@ if TYPE_CHECKING:  # services do not load what computes
 MAX_BATCH = 1000
 MAX_RETRIEVED = 1000
 DEFAULT_AUDITS, MAX_AUDITS = 10, 100
-MAX_NOTED = 10  # names in a line of the log
 MAX_COMPARED = 1000  # references, the first by id, with which a change of the scene is compared
-MAX_COMPARED_ADDED = 100  # stored ones that new ones are compared with: 1 ms, where adding takes hundreds
 STORE_THREADS = 4  # writers share one lock; the other threads keep readers from waiting for it
 
 T = TypeVar("T")
 M = TypeVar("M", pb.Scene, pb.Reference)
-
-
-class Draft(NamedTuple):
-    """A reference to be described and stored."""
-
-    reference_id: str
-    photo: Photo
-    world_from_camera: RigidTransform
-    provenance: Provenance
 
 
 class ReferenceService(rpcs.ReferenceServiceServicer):
@@ -103,6 +76,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         self._engine = engine
         self._store = store
         self._reach = Reach(store)
+        self._adding = Adding(engine, store, self._stored, adopted_hours)
         self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
         self._reporting = asyncio.Lock()  # a report of a large scene takes seconds and much memory
 
@@ -188,7 +162,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             raise FieldError("scene.adoption.max_radius_m", str(error)) from None
         warnings: list[str] = []
         if changes.keys() - {"calibration", "labels"}:
-            warnings = await self._stored(self._contradictions, scene, MAX_COMPARED, call)
+            warnings = await self._stored(contradictions, self._store, scene, MAX_COMPARED, call)
         if changes.get("adoption") is not None:
             warnings.append(kept_adopted(self._adopted_hours))
         return pb.UpdateSceneResponse(scene=scene_to_message(scene), warnings=warnings)
@@ -197,29 +171,6 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         """Whether a scene's unit is arbitrary after changes."""
         given = changes.get("arbitrary_unit")
         return self._store.get_attributes(key).arbitrary_unit if given is None else bool(given)
-
-    def _contradictions(
-        self, scene: SceneRecord, count: int, call: Call, added: Sequence[RigidTransform] = ()
-    ) -> list[str]:
-        """Returns and logs contradictions of the scene's attributes and poses of its first and of added references."""
-        from mapless_server.scenes.plausibility import contradictions  # services do not load what computes
-
-        try:
-            references = self._store.list_references(scene.scene_key, count, "")
-        except DataLoss as error:
-            return [f"the scene was not compared with its references: {error}"]
-        poses = [it.world_from_camera for it in references]
-        found = contradictions(poses, scene.attributes, added)
-        if found:
-            call.note(contradictions=found)
-        return found
-
-    def _contradictions_of_added(self, scene_key: SceneKey, added: Sequence[RigidTransform], call: Call) -> list[str]:
-        try:
-            scene = self._store.get_scene(scene_key)
-        except DataLoss as error:
-            return [f"the references were not compared with the scene: {error}"]
-        return self._contradictions(scene, MAX_COMPARED_ADDED, call, added)
 
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
         """Implements ReferenceService.ListScenes."""
@@ -246,9 +197,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def CreateReference(self, request: pb.CreateReferenceRequest, call: Call) -> pb.CreateReferenceResponse:
         """Implements ReferenceService.CreateReference."""
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
-        draft = self._draft(request, "")
+        draft = self._adding.draft(request, "")
         try:
-            (record,), warnings = await self._add(scene_key, [draft], call)
+            (record,), warnings = await self._adding.add(scene_key, [draft], call)
         except AlreadyExists as error:
             raise AlreadyExists(str(error), field="reference_id", resource=error.resource) from error
         return pb.CreateReferenceResponse(reference=reference_to_message(record), warnings=warnings)
@@ -269,9 +220,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             seen.add(item.reference_id)
         # Each access to a photograph copies it, which takes too long for the event loop.
         drafts = await asyncio.to_thread(
-            lambda: [self._draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
+            lambda: [self._adding.draft(item, f"requests[{i}]") for i, item in enumerate(request.requests)]
         )
-        records, warnings = await self._add(scene_key, drafts, call)
+        records, warnings = await self._adding.add(scene_key, drafts, call)
         messages = await _many(reference_to_message, records)
         return pb.BatchCreateReferencesResponse(references=messages, warnings=warnings)
 
@@ -407,85 +358,6 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         if (scene.create_time, is_arbitrary) != (before.create_time, before.attributes.arbitrary_unit):
             raise SceneMadeAnew
         return message_of(coverage, pb.CheckCoverageResponse, store_generation=generation, arbitrary_unit=is_arbitrary)
-
-    def _draft(self, request: pb.CreateReferenceRequest, path: str) -> Draft:
-        """Reads a reference and checks all but its pixels; FieldError or InvalidArgument names the wrong field."""
-        reference_id = wire.checked_id(request.reference_id, wire.joined(path, "reference_id"))
-        path = wire.joined(path, "reference")
-        if not request.HasField("reference"):
-            raise FieldError(path, "is required")
-        reference = request.reference
-        if not reference.HasField("world_from_camera"):
-            raise FieldError(f"{path}.world_from_camera", "is required")
-        world_from_camera = wire.transform_from_message(
-            reference.world_from_camera, f"{path}.world_from_camera", MAX_COORDINATE_M
-        )
-        limits = self._engine().options.image_limits
-        photo = with_depth(photo_from_message(reference, path, limits), reference, path, limits)
-        return Draft(reference_id, photo, world_from_camera, new_provenance(reference, path, self._adopted_hours))
-
-    async def _add(
-        self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call
-    ) -> tuple[Sequence[ReferenceRecord], list[str]]:
-        """Stores references; returns their records, and contradictions of the scene's attributes."""
-        # Describing takes long, so an unknown scene is rejected before. The store checks again when it adds.
-        added = [it.world_from_camera for it in drafts]
-        warnings = await self._stored(self._contradictions_of_added, scene_key, added, call)
-        call.note(scene=scene_key, references=len(drafts))
-        described = await self._engine().describe([it.photo for it in drafts], call.caller)
-        references = [
-            NewReference(
-                it.reference_id,
-                it.photo.image,
-                it.photo.camera,
-                it.world_from_camera,
-                found.views,
-                found.descriptors,
-                it.photo.mask,
-                it.provenance,
-                it.photo.depth,
-            )
-            for it, found in zip(drafts, described, strict=True)
-        ]
-        warnings += await self._stored(self._repeats, scene_key, drafts, call)
-        records = await self._stored(self._store.add_references, scene_key, references)
-        if blank := [record.reference_id for record in records if not record.feature_count]:
-            call.note(references_without_features=blank[:MAX_NOTED])
-        agreements = self._engine().references.agreements
-        agreements.changed(scene_key)
-        warnings += await self._stored(self._said_of, scene_key, agreements.known(scene_key))
-        shares = {it.reference_id: found.ignored_share for it, found in zip(records, described, strict=True)}
-        depths = {it.reference_id: found.median_depth for it, found in zip(records, described, strict=True)}
-        implausible = implausible_depths(depths)
-        if implausible and not await self._stored(self._is_arbitrary, scene_key):
-            warnings += implausible
-        return records, [*warnings, *nearly_ignored(shares)]
-
-    def _said_of(self, scene_key: SceneKey, agreement: Agreement) -> list[str]:
-        """Returns what is said of a scene's agreement; nothing of a unit that cannot be read."""
-        return agreement.warnings(arbitrary_unit=False) and agreement.warnings(self._is_arbitrary(scene_key))
-
-    def _is_arbitrary(self, scene_key: SceneKey) -> bool:
-        """Whether a scene's unit is arbitrary; one that cannot be read may be."""
-        try:
-            return self._store.get_attributes(scene_key).arbitrary_unit
-        except (DataLoss, NotFound):
-            return True
-
-    def _repeats(self, scene_key: SceneKey, drafts: Sequence[Draft], call: Call) -> list[str]:
-        """Returns and logs which poses or photographs the references to be added repeat."""
-        from mapless_server.scenes.repeats import PosedImage, repeats  # services do not load what computes
-
-        added = [PosedImage.of(it.reference_id, it.photo.image, it.world_from_camera) for it in drafts]
-        posed = [(it.photo.camera, it.world_from_camera) for it in drafts]
-        try:
-            stored = self._store.list_alike(scene_key, {it.image_sha256 for it in added}, posed)
-        except DataLoss as error:
-            return [f"the references were not compared with the scene's: {error}"]
-        found = repeats(added, stored)
-        if found:
-            call.note(repeats=found)
-        return found
 
     async def _stored(self, operation: Callable[..., T], *arguments: object) -> T:
         """Runs an operation of the store in a thread."""

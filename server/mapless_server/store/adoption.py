@@ -2,7 +2,7 @@
 
 An adopted reference is an ordinary one whose provenance says what vouches for it; a row in `adopted_reference` says
 where it belongs and how useful it is. A reference that is retired stays in the store, and leaves the indexes of all
-servers as a deleted one does (`queries.read_changes`); after it is restored they read the whole scene.
+servers as a deleted one does (`changes.read_changes`); after it is restored they read the whole scene.
 
 Two servers that adopt one photograph give it the same id, so that the database refuses the second.
 """
@@ -19,7 +19,7 @@ from sqlalchemy import Connection, Row, Select, select, update
 from mapless.provenance import ADOPTED
 from mapless_server.security import SceneKey
 
-from . import deletion, queries, restoring, retiring, rows
+from . import changes, deletion, queries, restoring, retiring, rows
 from .database import Database
 from .records import Adopted, NewReference, ReferenceRecord, RetirementReason, Standing
 from .store import Store
@@ -90,9 +90,9 @@ def adopt(
             raise PlaceFull
         left[:] = [it.key for it in leaving]
         if left:
-            generation = queries.begin_change(connection, scene_key, -len(left))
+            generation = changes.begin_change(connection, scene_key, -len(left))
             deletion.delete_references(connection, *left)
-            queries.note_removals(connection, scene_key, generation, left)
+            changes.note_removals(connection, scene_key, generation, left)
 
     (record,) = store.add_references(scene_key, [new], admit)
     if left:
@@ -277,7 +277,7 @@ def retire(store: Store, scene_key: SceneKey, keys: Sequence[str], reason: Retir
     column = reference.c
     of_scene = select(column.key).where(column.scene_id == scene_key, column.key.in_(keys))
     with store.changing() as connection:
-        generation = queries.begin_change(connection, scene_key)
+        generation = changes.begin_change(connection, scene_key)
         chosen = list(connection.scalars(of_scene.where(~queries.is_retired(column.key)).order_by(column.key)))
         retiring.retire(connection, scene_key, generation, chosen, reason)
     return chosen
@@ -289,7 +289,7 @@ def retire_by_operator(store: Store, scene_key: SceneKey, reference_id: str) -> 
     NotFound if there is no such scene or reference.
     """
     with store.changing() as connection:
-        generation = queries.begin_change(connection, scene_key)
+        generation = changes.begin_change(connection, scene_key)
         key = queries.find_key(connection, scene_key, reference_id)
         if not retiring.retired_among(connection, [key]):
             retiring.retire(connection, scene_key, generation, [key], RetirementReason.BY_OPERATOR)

@@ -20,10 +20,10 @@ from mapless_server.errors import NotFound
 from mapless_server.security import SceneKey
 
 from . import codec, queries, rows
+from .attributes import SelfCalibration
 from .database import Database
 from .pairs import next_try
 from .queries import is_detached
-from .records import SelfCalibration
 from .store import Store
 from .tables import adopted_reference, reference, scene, scene_calibration, scene_generation
 

@@ -47,7 +47,7 @@ from mapless.provenance import GIVEN_POSE, Provenance, provenance_from_json, pro
 from mapless.scenes import AdoptionPolicy, Calibration
 from mapless_server.method.features.views import Features, KeptDepth, Matches, View
 
-from .records import SceneAttributes, SelfCalibration
+from .attributes import SceneAttributes, SelfCalibration
 
 VIEW_FORMAT_VERSION, SMALL_VIEW_FORMAT_VERSION = 1, 2
 DEPTH_FORMAT_VERSION = 1

@@ -1,7 +1,7 @@
 """The store's database on PostgreSQL: connections, transactions, time limits.
 
 Reading is REPEATABLE READ and read-only, so that a call sees one moment. Writing is READ COMMITTED: everything that
-changes a scene first locks the row of its generation (see `queries.begin_change`), so the conflicts that SERIALIZABLE
+changes a scene first locks the row of its generation (see `changes.begin_change`), so the conflicts that SERIALIZABLE
 would detect at the end cannot occur.
 
 A commit is acknowledged when it is on the disk. A commit whose acknowledgement is lost is reported as Unavailable,

@@ -1,15 +1,10 @@
-"""Statements that several operations of the store share; each runs in the caller's transaction.
-
-`read_changes` finds what has changed in a scene since a generation, so that indexes in memory are updated without
-reading the whole scene.
-"""
+"""Statements that several operations of the store share; each runs in the caller's transaction."""
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, func, insert, or_, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, Table, and_, delete, func, insert, or_, select
 from sqlalchemy.dialects import sqlite
 
 from mapless.names import reference_name, scene_name
@@ -26,22 +21,17 @@ from mapless_server.security import (
 )
 
 from . import rows
-from .database import unless_damaged
-from .records import IndexedReference, SceneChanges, SceneRecord
+from .records import SceneRecord
 from .tables import (
     features,
     global_descriptor,
     reference,
     reference_standing,
-    removed_reference,
     scene,
     scene_calibration,
     scene_generation,
     scene_label,
 )
-
-GENERATIONS_REMEMBERED = 100_000
-"""How far back `read_changes` knows what was deleted, some 10 MB per scene; older callers read the whole scene."""
 
 DETACHED = "-/"
 """Prefix of the keys of detached scenes: no tenant's name is a hyphen."""
@@ -49,10 +39,6 @@ _DETACHED_END = "-0"
 """The first text, by code point, after all of them."""
 _IDS_PER_STATEMENT = 500
 """Databases bound the number of parameters of a statement."""
-_ROWS_AT_A_TIME = 2000
-"""A few megabytes, so that a scene that is read whole is not in memory twice."""
-_Found = tuple[tuple[IndexedReference, ...], tuple[str, ...]]
-"""References, and the ids of damaged ones; both ordered by id."""
 
 
 def select_scenes() -> Select[Any]:
@@ -123,7 +109,7 @@ def find_scene(connection: Connection, scene_key: SceneKey, limit: SceneLimit | 
     found = select_scenes().where(scene.c.scene_id == scene_key)
     if limit is not None:
         found = found.where(is_within(limit, tenant_of(scene_key)))
-    return _one(connection, found, lambda: _scene_not_found(scene_key))
+    return _one(connection, found, lambda: scene_not_found(scene_key))
 
 
 def find_calibrations(connection: Connection, scene_key: SceneKey) -> Sequence[Row[Any]]:
@@ -138,7 +124,7 @@ def read_generation(connection: Connection, scene_key: SceneKey) -> int:
     statement: Select[Any] = select(scene_generation.c.generation).join(
         scene, scene.c.scene_id == scene_generation.c.scene_id
     )
-    row = _one(connection, statement.where(scene.c.scene_id == scene_key), lambda: _scene_not_found(scene_key))
+    row = _one(connection, statement.where(scene.c.scene_id == scene_key), lambda: scene_not_found(scene_key))
     generation: int = row.generation
     return generation
 
@@ -147,53 +133,6 @@ def read_generations(connection: Connection) -> dict[str, int]:
     """Generations by scene key, of all scenes that ever existed."""
     column = scene_generation.c
     return {row.scene_id: row.generation for row in connection.execute(select(column.scene_id, column.generation))}
-
-
-def raise_generation(connection: Connection, scene_key: SceneKey) -> int:
-    """Counts a change of a scene, which need not exist; returns the new generation.
-
-    Every change does this before it reads anything: where the database admits several writers, the counter's row is the
-    lock that orders the changes of a scene.
-    """
-    column = scene_generation.c
-    first = _upsert(connection, scene_generation).values(scene_id=scene_key, generation=1)
-    change = first.on_conflict_do_update(index_elements=[column.scene_id], set_={"generation": column.generation + 1})
-    connection.execute(change)
-    generation: int = connection.execute(select(column.generation).where(column.scene_id == scene_key)).scalar_one()
-    return generation
-
-
-def begin_change(connection: Connection, scene_key: SceneKey, added_count: int = 0) -> int:
-    """Counts a change of a scene and the references that it adds; returns the new generation. Raises NotFound."""
-    generation = raise_generation(connection, scene_key)
-    count = scene.c.reference_count + added_count
-    change = update(scene).where(scene.c.scene_id == scene_key).values(reference_count=count)
-    if connection.execute(change).rowcount != 1:
-        raise _scene_not_found(scene_key)
-    return generation
-
-
-def lock_changes(connection: Connection, scene_key: SceneKey) -> None:
-    """Changes of a scene, which need not exist, wait for the end of the transaction; none is counted."""
-    column = scene_generation.c
-    connection.execute(select(column.generation).where(column.scene_id == scene_key).with_for_update())
-
-
-def note_removals(connection: Connection, scene_key: SceneKey, generation: int, keys: Sequence[str]) -> None:
-    """Notes for `read_changes` which references are not chosen any more since a generation, and forgets the oldest."""
-    if keys:
-        tombstones = [{"scene_id": scene_key, "generation": generation, "reference_key": key} for key in keys]
-        connection.execute(insert(removed_reference), tombstones)
-    forget_removals(connection, scene_key, generation - GENERATIONS_REMEMBERED)
-
-
-def forget_removals(connection: Connection, scene_key: SceneKey, until_generation: int) -> None:
-    """Deletes the tombstones up to a generation; callers that know an earlier one then read the whole scene."""
-    removed = removed_reference.c
-    old = delete(removed_reference).where(removed.scene_id == scene_key, removed.generation <= until_generation)
-    if connection.execute(old).rowcount:
-        known = update(scene).where(scene.c.scene_id == scene_key)
-        connection.execute(known.values(first_generation=until_generation))
 
 
 def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequence[str] | None) -> dict[str, str]:
@@ -315,13 +254,13 @@ def is_retired(key: ColumnElement[str]) -> ColumnElement[bool]:
 
 def insert_new(connection: Connection, table: Table, row: Mapping[str, Any]) -> bool:
     """Inserts a row unless one with its primary key exists; returns whether it was inserted."""
-    addition = _upsert(connection, table).values(row).on_conflict_do_nothing()
+    addition = upsert(connection, table).values(row).on_conflict_do_nothing()
     return connection.execute(addition, execution_options={"preserve_rowcount": True}).rowcount == 1
 
 
 def add_to(connection: Connection, table: Table, row: Mapping[str, Any], summed: Collection[str]) -> None:
     """Adds a row's values of the `summed` columns to the row with its primary key, or inserts it if there is none."""
-    addition = _upsert(connection, table).values(row)
+    addition = upsert(connection, table).values(row)
     sums = {name: table.c[name] + addition.excluded[name] for name in summed}
     connection.execute(addition.on_conflict_do_update(index_elements=list(table.primary_key), set_=sums))
 
@@ -337,7 +276,8 @@ def _reference_deleted() -> NotFound:
     return NotFound("a reference was deleted while it was used")
 
 
-def _scene_not_found(scene_key: SceneKey) -> NotFound:
+def scene_not_found(scene_key: SceneKey) -> NotFound:
+    """The error for a scene that does not exist."""
     scene_id = scene_id_of(scene_key)
     return NotFound(f"there is no scene {scene_id!r}", field="scene", resource=scene_name(scene_id))
 
@@ -362,7 +302,7 @@ def _exists(key: str) -> ColumnElement[bool]:
     return (reference.c.key == key) & ~is_detached(reference.c.scene_id)
 
 
-def _upsert(connection: Connection, table: Table) -> Any:
+def upsert(connection: Connection, table: Table) -> Any:
     """An INSERT that supports ON CONFLICT; each of the two dialects has its own class for it."""
     if connection.dialect.name == "sqlite":
         return sqlite.insert(table)
@@ -375,60 +315,6 @@ def portions(ids: Sequence[str]) -> Iterator[Sequence[str]]:
     """The ids, in portions of so many as one statement may name."""
     for start in range(0, len(ids), _IDS_PER_STATEMENT):
         yield ids[start : start + _IDS_PER_STATEMENT]
-
-
-def read_changes(
-    connection: Connection, scene_key: SceneKey, since_generation: int | None, descriptor_name: str
-) -> SceneChanges:
-    """See `Store.list_changes`; runs in the caller's transaction, which must see one moment."""
-    row = find_scene(connection, scene_key)
-    generation: int = row.generation
-    # A later generation than the scene's is that of a database which has been replaced by a backup.
-    if since_generation is None or not row.first_generation <= since_generation <= generation:
-        added, damaged = _read(connection, scene_key, -1, descriptor_name)
-        return SceneChanges(generation, added, frozenset(), True, damaged)
-    if since_generation == generation:
-        return SceneChanges(generation, (), frozenset(), False)
-    removed = removed_reference.c
-    gone = select(removed.reference_key).where(removed.scene_id == scene_key, removed.generation > since_generation)
-    added, damaged = _read(connection, scene_key, since_generation, descriptor_name)
-    return SceneChanges(generation, added, frozenset(connection.scalars(gone)), False, damaged)
-
-
-def _read(connection: Connection, scene_key: SceneKey, after_generation: int, descriptor_name: str) -> _Found:
-    """The references that were added or described after a generation."""
-    column, descriptor = reference.c, global_descriptor.c
-    is_changed = and_(column.scene_id == scene_key, column.generation > after_generation, ~is_retired(column.key))
-    indexed: Select[Any] = select(
-        column.reference_id, column.key, column.geometry, column.geometry_sha256, descriptor.data, descriptor.sha256
-    ).outerjoin(global_descriptor, and_(descriptor.reference_key == column.key, descriptor.name == descriptor_name))
-
-    def read_together() -> _Found:
-        result = connection.execute(indexed.where(is_changed), execution_options={"yield_per": _ROWS_AT_A_TIME})
-        references: list[IndexedReference] = []
-        damaged: list[str] = []
-        for portion in result.partitions():
-            some, damaged_ids = rows.indexed_references(portion, descriptor_name)
-            references += some
-            damaged += damaged_ids
-        return tuple(sorted(references, key=lambda it: it.reference_id)), tuple(sorted(damaged))
-
-    def read_each() -> _Found:
-        changed = select(column.reference_id, column.key).where(is_changed).order_by(column.reference_id)
-        references: list[IndexedReference] = []
-        damaged: list[str] = []
-        for row in connection.execute(changed).all():
-            one = indexed.where(column.key == row.key)
-            found = unless_damaged(connection, partial(all_rows, connection, one), lambda: None)
-            if found is None:
-                damaged.append(row.reference_id)
-                continue
-            some, damaged_ids = rows.indexed_references(found, descriptor_name)
-            references += some
-            damaged += damaged_ids
-        return tuple(references), tuple(damaged)
-
-    return unless_damaged(connection, read_together, read_each)
 
 
 def all_rows(connection: Connection, statement: Select[Any]) -> Sequence[Row[Any]]:

@@ -19,17 +19,10 @@ from mapless_server.security import SceneKey
 
 from . import codec, queries, rows, tables
 from .alike import find_alike
+from .attributes import SceneAttributes
+from .changes import read_changes
 from .database import DamagedPages, Database, unavailable, unless_damaged
-from .queries import read_changes
-from .records import (
-    DescribedReference,
-    ReferenceRecord,
-    SceneAttributes,
-    SceneChanges,
-    SceneRecord,
-    SceneSnapshot,
-    SceneState,
-)
+from .records import DescribedReference, ReferenceRecord, SceneChanges, SceneRecord, SceneSnapshot, SceneState
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -17,7 +17,7 @@ from sqlalchemy import Connection, Row, Select, delete, func, select, update
 from mapless_server.errors import DataLoss, FailedPrecondition
 from mapless_server.security import SceneKey
 
-from . import queries, retiring, rows
+from . import changes, queries, retiring, rows
 from .records import ReferenceRecord
 from .store import Store
 from .tables import adopted_reference, reference, reference_standing, removed_reference, scene
@@ -55,7 +55,7 @@ def restore(store: Store, scene_key: SceneKey, since: datetime | None = None, pl
     )
     is_current = column.scene_id == scene_key
     with store.changing() as connection:
-        generation = queries.begin_change(connection, scene_key)
+        generation = changes.begin_change(connection, scene_key)
         if place_id:
             place_key = queries.find_key(connection, scene_key, place_id, "place")
             here = select(adopted_reference.c.reference_key).where(adopted_reference.c.place_key == place_key)
@@ -78,7 +78,7 @@ def restore_reference(store: Store, scene_key: SceneKey, reference_id: str) -> R
     NotFound if there is no such scene or reference; FailedPrecondition if it stays retired, and why.
     """
     with store.changing() as connection:
-        generation = queries.begin_change(connection, scene_key)
+        generation = changes.begin_change(connection, scene_key)
         key = queries.find_key(connection, scene_key, reference_id)
         staying = _restore_lasting(connection, scene_key, generation, retiring.retired_among(connection, [key]))
         if key in staying:

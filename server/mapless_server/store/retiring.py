@@ -6,7 +6,7 @@ from sqlalchemy import Connection, select, update
 
 from mapless_server.security import SceneKey
 
-from . import queries, rows
+from . import changes, queries, rows
 from .records import RetirementReason
 from .tables import reference, reference_standing
 
@@ -20,7 +20,7 @@ def retire(
         queries.insert_new(connection, reference_standing, {"reference_key": key})
         row = update(reference_standing).where(reference_standing.c.reference_key == key)
         connection.execute(row.values(values))
-    queries.note_removals(connection, scene_key, generation, keys)
+    changes.note_removals(connection, scene_key, generation, keys)
 
 
 def retired_among(connection: Connection, keys: Sequence[str]) -> list[str]:

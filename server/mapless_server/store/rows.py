@@ -20,6 +20,7 @@ from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, scene_id_of
 
 from . import codec
+from .attributes import SceneAttributes, SelfCalibration
 from .depth_images import decode_depth_image
 from .records import (
     DescribedReference,
@@ -28,9 +29,7 @@ from .records import (
     ReferenceRecord,
     Retirement,
     RetirementReason,
-    SceneAttributes,
     SceneRecord,
-    SelfCalibration,
     Standing,
 )
 
@@ -239,7 +238,7 @@ def descriptors(found: Mapping[str, Row[Any]], name: str) -> dict[str, NDArray[n
 
 
 def indexed_references(found: Sequence[Row[Any]], descriptor_name: str) -> tuple[list[IndexedReference], list[str]]:
-    """Reads rows of `queries.read_changes`, all at once for speed; also returns the ids of damaged ones."""
+    """Reads rows of `changes.read_changes`, all at once for speed; also returns the ids of damaged ones."""
     intact = [row for row in found if _is_intact(row, descriptor_name)]
     poses = codec.decode_poses([row.geometry for row in intact])
     vectors = iter(codec.decode_descriptors([row.data for row in intact if row.sha256 is not None]))

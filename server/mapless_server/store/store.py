@@ -22,7 +22,8 @@ from mapless_server.errors import AlreadyExists, DataLoss, NotFound, Overloaded
 from mapless_server.method.features.views import View
 from mapless_server.security import SceneKey, SceneLimit, scene_id_of
 
-from . import deletion, queries, rows, tables
+from . import changes, deletion, queries, rows, tables
+from .attributes import SceneAttributes
 from .database import DamagedPages, Database, with_room_to_delete
 from .deletion import PendingDeletions
 from .depth_images import encode_depth_image
@@ -34,7 +35,6 @@ from .records import (
     NewReference,
     ReferenceRecord,
     Retirement,
-    SceneAttributes,
     SceneRecord,
 )
 from .scene_groups import SceneGroups
@@ -168,7 +168,7 @@ class Store(StoreReader):
         """Creates a scene without references; AlreadyExists if the id is taken."""
         now, scene = _now(), tables.scene
         with self.changing() as connection:
-            generation = queries.raise_generation(connection, scene_key)
+            generation = changes.raise_generation(connection, scene_key)
             if connection.scalar(select(scene.c.scene_id).where(scene.c.scene_id == scene_key)) is not None:
                 scene_id = scene_id_of(scene_key)
                 message = f"scene {scene_id!r} exists already"
@@ -205,19 +205,19 @@ class Store(StoreReader):
         given: dict[str, Any] = {"datum": datum, "down_in_world": down_in_world, "calibration": calibration}
         replaces_damaged = UNCHANGED not in given.values()
         given |= {"arbitrary_unit": arbitrary_unit, "adoption": adoption}
-        changes = {name: value for name, value in given.items() if value is not UNCHANGED}
+        changed = {name: value for name, value in given.items() if value is not UNCHANGED}
         with self.changing() as connection:
-            if changes or labels is UNCHANGED:
-                queries.begin_change(connection, scene_key)
+            if changed or labels is UNCHANGED:
+                changes.begin_change(connection, scene_key)
             else:
-                queries.lock_changes(connection, scene_key)
+                changes.lock_changes(connection, scene_key)
             stored, found = queries.find_scene(connection, scene_key, limit), NO_ATTRIBUTES
             try:
                 found = rows.scene_attributes(stored)
             except DataLoss:
                 if not replaces_damaged:
                     raise
-            row = rows.attributes_row(scene_key, found.changed(changes))
+            row = rows.attributes_row(scene_key, found.changed(changed))
             connection.execute(update(tables.scene).where(tables.scene.c.scene_id == scene_key).values(row))
             if labels is not UNCHANGED:
                 queries.replace_labels(connection, scene_key, labels)
@@ -253,7 +253,7 @@ class Store(StoreReader):
         # To detach so many would take as long as to delete them.
         deletion.delete_counts_where(self.database, tables.scene_count.c.scene_id == scene_key)
         with self.changing() as connection:
-            queries.begin_change(connection, scene_key)
+            changes.begin_change(connection, scene_key)
             self.database.lift_limits(connection)
             deletion.detach_scene(connection, scene_key)
 
@@ -290,7 +290,7 @@ class Store(StoreReader):
             if new.provenance.source == ADOPTED:
                 adopted_rows.append(rows.adopted_row(record, new))
         with self.changing() as connection:
-            generation = queries.begin_change(connection, scene_key, len(records))
+            generation = changes.begin_change(connection, scene_key, len(records))
             admit(connection)
             queries.refuse_taken_ids(connection, scene_key, [new.reference_id for new in references])
             connection.execute(insert(tables.reference), [row | {"generation": generation} for row in reference_rows])
@@ -361,10 +361,10 @@ class Store(StoreReader):
         self, scene_key: SceneKey, reference_id: str, delete: Callable[[Connection, str], None]
     ) -> str:
         with self.changing() as connection:
-            generation = queries.begin_change(connection, scene_key, -1)
+            generation = changes.begin_change(connection, scene_key, -1)
             key = queries.find_key(connection, scene_key, reference_id)
             delete(connection, key)
-            queries.note_removals(connection, scene_key, generation, [key])
+            changes.note_removals(connection, scene_key, generation, [key])
         return key
 
     @observed

@@ -95,7 +95,7 @@ reference = Table(
     Index("reference_by_geometry", "scene_id", "geometry"),
 )
 
-# Tombstones: references that were deleted in the latest generations of a scene, see queries.GENERATIONS_REMEMBERED.
+# Tombstones: references that were deleted in the latest generations of a scene, see changes.GENERATIONS_REMEMBERED.
 removed_reference = Table(
     "removed_reference",
     metadata,

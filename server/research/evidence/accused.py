@@ -27,7 +27,7 @@ from mapless_server.method.judge import cameras
 from mapless_server.method.judge.hints import hinted
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.method.pipeline import Pipeline
 from mapless_server.method.rejection import IntrinsicsCheck, IntrinsicsParameter
 from mapless_tools.dataset import Dataset

@@ -14,7 +14,7 @@ from mapless_server.method.features.extractors import make_extractor
 from mapless_server.method.features.rolls import similarity_of
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.options import StageContext
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.method.promise import PROMISE
 from mapless_tools.dataset import Frame
 from research.places import Place, Scenes, own_and_other

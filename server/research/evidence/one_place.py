@@ -22,11 +22,11 @@ from mapless_server.method.judge.decide import PLACES, PlaceOptions, at_one_plac
 from mapless_server.method.judge.hypothesis import Found, Hypothesis
 from mapless_server.method.localize import attempts
 from mapless_server.method.options import DoubtOptions, LocalizeOptions, StageContext
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.method.pipeline import Pipeline, prepare, reconstruct
 from mapless_server.method.rejection import Rejection, RejectionReason
 from mapless_server.services.messages.priors import priors_from_message
-from mapless_server.store.records import SceneAttributes
+from mapless_server.store.attributes import SceneAttributes
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.evaluate.references import choose_references
 from research.contradictions.cases import Case, Expected, cases_of

@@ -22,7 +22,7 @@ from mapless_server.method.features.views import PosedView, View, reduce_image
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.method.pipeline import Pipeline
 from mapless_tools.demo.photographs import room
 from mapless_tools.evaluate.metrics import pose_error

@@ -21,7 +21,7 @@ from mapless_server.method.features.views import Features, Matches, PosedView, V
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.localize import localize
 from mapless_server.method.options import LocalizeOptions
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.method.pairs.stationary import StationaryOptions, displacements_px, fixed_in, share_of_parts
 from mapless_server.method.pipeline import Pipeline
 from mapless_tools.dataset import Dataset

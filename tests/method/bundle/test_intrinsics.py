@@ -25,8 +25,9 @@ from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.method.features.views import View, undistort_pixels
 from mapless_server.method.judge import cameras
 from mapless_server.method.judge.answer import Answer
-from mapless_server.method.judge.cameras import intrinsics_checks, wrong_camera, wrong_intrinsics
+from mapless_server.method.judge.cameras import wrong_camera
 from mapless_server.method.judge.hints import hinted
+from mapless_server.method.judge.intrinsics import intrinsics_checks, is_camera_doubtful, wrong_intrinsics
 from mapless_server.method.rejection import Advice, IntrinsicsParameter, Rejection, RejectionReason
 from mapless_server.method.structure.model import PointMatches
 
@@ -498,7 +499,7 @@ def test_a_camera_that_sees_no_keypoint_fits_nothing(monkeypatch: pytest.MonkeyP
 
 
 def test_a_camera_that_nothing_doubts_is_not_compared() -> None:
-    assert rejection_of(focal=2.0, doubted=2.9)[0] is None
+    assert [is_camera_doubtful(support_of(focal=2.0, doubted=it)[0]) for it in (2.9, 3.1)] == [False, True]
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.5, 0.8])

@@ -10,7 +10,7 @@ from support.scenes import CAMERA, random_for, unit_rows
 
 from mapless.geometry import RigidTransform
 from mapless_server.method.features.views import Features, PosedView, View
-from mapless_server.method.pairs.correspond import make_matcher
+from mapless_server.method.pairs.make import make_matcher
 
 torch = pytest.importorskip("torch", reason="the learned features' extra is not installed")
 pytest.importorskip("kornia", reason="the learned features' extra is not installed")

@@ -27,8 +27,9 @@ from mapless_server.method.features.matching import (
 )
 from mapless_server.method.features.views import Features, Matches, PosedView, View
 from mapless_server.method.pairs import pair as reference_pairs
-from mapless_server.method.pairs.correspond import Matcher, make_matcher
+from mapless_server.method.pairs.correspond import Matcher
 from mapless_server.method.pairs.epipolar import epipolar_distance_px, epipolar_distances_px
+from mapless_server.method.pairs.make import make_matcher
 from mapless_server.method.pairs.pair import Matching, in_order
 from mapless_server.scheduling.processor import lower_priority
 

@@ -43,13 +43,7 @@ from ..structure.structure import StructureOptions, tracks_with_query
 from .bundle import BundleProblem, free_problem
 from .dispersion import UncertaintyOptions, disperse, dispersed_covariance
 from .estimate import PoseEstimate, PoseStage, Support
-from .intrinsics import (
-    ContradictionOptions,
-    IntrinsicsEvidence,
-    IntrinsicsTerms,
-    intrinsics_evidence,
-    keypoint_motion,
-)
+from .intrinsics import ContradictionOptions, IntrinsicsEvidence, IntrinsicsTerms, intrinsics_evidence, keypoint_motion
 from .normal_equations import Bundle, Linearized, NormalEquations, Poses
 from .priors import IntrinsicsSigma
 from .stated import common_covariance, stated_covariance

@@ -1,16 +1,11 @@
-"""Checks of a photograph's intrinsics against its matches: a linear one, and the comparison with other cameras.
+"""Comparison of a photograph's camera with others, by the poses that explain its matches.
 
-Cropped, resized and undistorted photographs often come with the intrinsics of another image. The pose is then off, with
-small residuals: its motion absorbs most of such an error. What it does not absorb is in the normal equations of the
-adjustment (see `bundle.intrinsics`). A parameter that is off by more than the prior and its standard deviation allow
-together is a reason to reject the pose, although it was estimated with the photograph's value: the camera's next
-photograph will have the same error.
-
-Half or double the focal length, or a wide lens whose distortion is left out, are too far off for that: a pose then fits
-a part of the matches, at similar depths or near the centre, and these do not contradict it. But far more of all matches
-agree with one pose of a camera that is nearer to the true one. So poses are computed with other focal lengths, other
-values of k1, without the lens, and, where these are unusual, with the principal point in the centre and with square
-pixels; the score of `pose.relative` compares them, by points and by matches without points together.
+Half or double the focal length, or a wide lens whose distortion is left out, are too far off for the linear check
+(`judge.intrinsics`): a pose then fits a part of the matches, at similar depths or near the centre, and these do not
+contradict it. But far more of all matches agree with one pose of a camera that is nearer to the true one. So poses are
+computed with other focal lengths, other values of k1, without the lens, and, where these are unusual, with the
+principal point in the centre and with square pixels; the score of `pose.relative` compares them, by points and by
+matches without points together.
 
 A camera is accused only if that is significant (`significance`): if the keypoints that score higher with another
 camera outweigh those that score lower by more than chance, with the best poses of both cameras that are found from all
@@ -18,7 +13,7 @@ matches. A pose that is explained clearly worse than one of another camera is re
 significant, for lack of evidence.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +24,7 @@ from mapless.lenses import Distortion, Fisheye
 
 from ..bundle.adjust import LEAST_MATCHES
 from ..bundle.estimate import PosedSupport, Support
-from ..bundle.intrinsics import DOUBTED_SIGMAS, ContradictionOptions, IntrinsicsEvidence, corrected, read_as
+from ..bundle.intrinsics import corrected, read_as
 from ..bundle.priors import IntrinsicsSigma
 from ..features.views import View
 from ..pose import pnp
@@ -38,85 +33,7 @@ from ..pose.relative import Evidence, RelativePoseOptions, find_pose, scores_by_
 from ..pose.two_view_matches import TwoViewMatches
 from ..rejection import Advice, Hint, IntrinsicsCheck, IntrinsicsParameter, Rejection, RejectionReason
 from ..significance import is_significant, sigmas_of_gains
-
-
-def intrinsics_checks(evidence: IntrinsicsEvidence) -> tuple[IntrinsicsCheck, ...]:
-    """The checks of all parameters, in pixels of the photograph as it was sent."""
-    sent, scale = evidence.sent, evidence.sent.width_px / evidence.given.width_px
-    given = _parameters(sent)
-    unit = np.array([sent.focal_x_px, scale, scale, 1.0])
-    change = unit * evidence.value
-    change[0] = sent.focal_x_px * np.expm1(evidence.value[0])
-    estimated, sigma, given_sigma = given + change, unit * evidence.sigma, unit * evidence.prior_sigma
-    conflict, used = evidence.contradicted(ContradictionOptions(), evidence.prior_sigma), evidence.removed != 0
-    return _checks(np.stack([given, estimated, sigma, given_sigma], axis=1), conflict, used)
-
-
-def _checks(values: Array, conflict: NDArray[np.bool_], used: NDArray[np.bool_]) -> tuple[IntrinsicsCheck, ...]:
-    """The checks of all parameters; rows of `values` (4, 4) are given, estimated, and their standard deviations."""
-    rows = zip(IntrinsicsParameter, values.tolist(), conflict.tolist(), used.tolist(), strict=True)
-    return tuple(
-        IntrinsicsCheck(parameter, given, estimated, sigma, given_sigma, conflict=is_wrong, used=is_used)
-        for parameter, (given, estimated, sigma, given_sigma), is_wrong, is_used in rows
-    )
-
-
-def _parameters(camera: Camera) -> Array:
-    """The values (4,) of a camera's checked parameters."""
-    k1 = camera.distortion.k1 if camera.distortion else 0.0
-    return np.array([camera.focal_x_px, camera.principal_x_px, camera.principal_y_px, k1])
-
-
-def wrong_intrinsics(evidence: IntrinsicsEvidence, best_reference: str) -> Rejection | None:
-    """A rejection that names each parameter in conflict, the most significant first; None if there is none."""
-    checks = intrinsics_checks(evidence)
-    wrong = sorted(
-        (it for it in checks if it.conflict), key=lambda it: -abs(it.estimated - it.given) / it.estimated_sigma
-    )
-    if not wrong:
-        return None
-    message = "; ".join(_sentence(it) for it in wrong)
-    hint = Hint("judge", Advice.CHECK_CALIBRATION, advice_for(evidence.sent.distortion, wrong), best_reference)
-    return Rejection(RejectionReason.GATE, message, hint, intrinsics_checks=checks)
-
-
-def _sentence(check: IntrinsicsCheck) -> str:
-    name, digits = check.parameter.field, 3 if check.parameter is IntrinsicsParameter.K1 else 1
-    return (
-        f"{name} is {check.given:.{digits}f}, the photograph says {check.estimated:.{digits}f} +- "
-        f"{check.estimated_sigma:.{digits}f}"
-    )
-
-
-def advice_for(lens: Distortion | None, wrong: Sequence[IntrinsicsCheck]) -> str:
-    """The parameters to check, in words, of a camera with this lens of which these parameters are wrong."""
-    found = {it.parameter: it for it in wrong}
-    radial = found.get(IntrinsicsParameter.K1)
-    if radial is not None and lens == Fisheye():
-        return (
-            f"The camera is given as a fisheye without coefficients: the photograph says k1 = {radial.estimated:.2f}. "
-            "Give the lens's coefficients, or no fisheye for a photograph that is undistorted already."
-        )
-    if radial is not None and not lens:
-        return (
-            f"The camera is given without lens distortion: the photograph says k1 = {radial.estimated:.2f}. Give the "
-            "lens's coefficients, or undistort the photograph."
-        )
-    if radial is not None:
-        return (
-            "Check the photograph's lens distortion: the model, the order of its coefficients, and whether the "
-            "photograph is undistorted already."
-        )
-    if IntrinsicsParameter.FOCAL_LENGTH in found:
-        return (
-            "Check the photograph's focal length: intrinsics belong to one image size, change with it when a "
-            "photograph is resized, and have another principal point when it is cropped."
-        )
-    return (
-        "Check the photograph's principal point: it is in pixels from the centre of the top-left one, x first, and "
-        "moves when a photograph is cropped, resized or rotated."
-    )
-
+from .intrinsics import advice_for, checked_parameters, checks_of
 
 MANY_MATCHES = 100
 """So many matches are not by chance: a reference shows what the photograph shows, and with points another camera needs
@@ -322,13 +239,9 @@ def compare_cameras(support: Support) -> Comparison | None:
 def wrong_camera(support: PosedSupport, best_reference: str) -> Rejection | None:
     """A rejection if a pose of another camera scores clearly higher; it names the camera if that is significant.
 
-    A pose that rests on matches without points is compared whatever the linear check says, with few cameras by a brief
-    search.
+    A pose that rests on matches without points is compared with few cameras by a brief search.
     """
-    evidence, by_lines = support.estimate.intrinsics, support.two_view is not None
-    if not by_lines and (evidence is None or not _is_doubtful(evidence)):
-        return None
-    found = compare_cameras(support)
+    by_lines, found = support.two_view is not None, compare_cameras(support)
     if found is None:
         return None
     inliers, least = support.estimate.inliers, 1.0
@@ -351,14 +264,6 @@ def wrong_camera(support: PosedSupport, best_reference: str) -> Rejection | None
 def _difference(check: IntrinsicsCheck) -> str:
     digits = 2 if check.parameter is IntrinsicsParameter.K1 else 0
     return f"{check.parameter.field} {check.estimated:.{digits}f} instead of {check.given:.{digits}f}"
-
-
-def _is_doubtful(evidence: IntrinsicsEvidence) -> bool:
-    """Whether the linear check speaks against the camera, or cannot speak for it."""
-    off = np.abs(evidence.value) > DOUBTED_SIGMAS * np.hypot(evidence.sigma, evidence.prior_sigma)
-    return bool(
-        off.any() or evidence.sigma[0] > ContradictionOptions.focal_share or evidence.sigma[3] > ContradictionOptions.k1
-    )
 
 
 def _other_cameras(given: Camera, prior_sigma: Array, steps: _Steps) -> Iterator[Camera]:
@@ -413,7 +318,7 @@ def _differences(
 ) -> tuple[IntrinsicsCheck, ...]:
     """The parameters that differ, in pixels of the photograph as sent; standard deviations are those of the steps."""
     scale, uniform = sent.width_px / found.width_px, 1 / np.sqrt(12)
-    of_sent, centre_sigma_px = _parameters(sent), sent.width_px / 20
+    of_sent, centre_sigma_px = checked_parameters(sent), sent.width_px / 20
     before, after = (
         np.array([it.focal_x_px, it.principal_x_px, it.principal_y_px, _bend(it)]) for it in (given, found)
     )
@@ -422,4 +327,4 @@ def _differences(
     estimated = of_sent + np.array([scale, scale, scale, 1.0]) * (after - before)
     given_sigma = np.array([sent.focal_x_px, scale, scale, 1.0]) * prior_sigma
     values = np.stack([of_sent, estimated, sigma, given_sigma], axis=1)
-    return tuple(it for it in _checks(values, after != before, np.zeros(4, bool)) if it.conflict)
+    return tuple(it for it in checks_of(values, after != before, np.zeros(4, bool)) if it.conflict)

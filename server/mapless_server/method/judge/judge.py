@@ -39,8 +39,9 @@ from ..optim.optimize import pose_hessian, world_covariance
 from ..pose.by_depths import Found
 from ..pose.pnp import LN_10, MAX_LOG10_FALSE_ALARMS, PnpOptions, disc_chance, false_alarms, format_false_alarms, ransac
 from ..rejection import Advice, Hint, PoseHypothesis, Rejection, RejectionReason
-from .cameras import wrong_camera, wrong_intrinsics
+from .cameras import wrong_camera
 from .evidence import Evidence, Votes, evidence_of, votes_of
+from .intrinsics import is_camera_doubtful, wrong_intrinsics
 from .references import disagreeing_references, supporters_of
 
 RIVAL_MIN_KEYPOINTS = 10
@@ -153,7 +154,7 @@ def contradiction(
     wrong = wrong_intrinsics(evidence, best) if evidence else None
     if wrong:
         return (_too_uncertain(support) if _is_guessed(support) else None) or wrong  # what is unknown is not accused
-    if wrong := wrong_camera(support, best):
+    if is_camera_doubtful(support) and (wrong := wrong_camera(support, best)):
         return wrong
     hypotheses = find_rival(support, votes)
     if hypotheses:

@@ -10,16 +10,12 @@ import time
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapless_server.cache import LruCache
 
 from ..features.matching import (
-    OPTIONS,
     CorrespondOptions,
     NearestNeighbours,
     PairMatching,
@@ -27,105 +23,9 @@ from ..features.matching import (
     RowMaxima,
     SharedThreads,
 )
-from ..features.tracks import keypoint_offsets
 from ..features.views import Features, Matches, PosedView, ReferenceErrors, View
+from .fixed import references_without_fixed, without_fixed
 from .pair import Matching, PairKey, PairMatches, ReferencePairs, in_order
-from .stationary import IgnoredKeypoints, StationaryOptions, without_ignored
-
-if TYPE_CHECKING:
-    from ..features.lightglue import LightGlueMatching
-
-
-@dataclass(frozen=True, eq=False)
-class ReferencesWithoutFixed:
-    """References, in whatever order, without what is fixed to their cameras.
-
-    Attributes:
-        ignored: parts of the images; false if nothing is fixed.
-        of_reference: mask (N,) of the ignored keypoints, by the reference's key.
-        pairs: the agreeing matches of pairs without ignored keypoints, by the keys of both references.
-    """
-
-    ignored: IgnoredKeypoints
-    of_reference: Mapping[str, NDArray[np.bool_]]
-    pairs: Mapping[tuple[str, str], Matches]
-
-    @classmethod
-    def of(
-        cls,
-        references: Sequence[PosedView],
-        pairs: Mapping[tuple[int, int], PairMatches],
-        options: StationaryOptions,
-    ) -> "ReferencesWithoutFixed":
-        """Finds it by the matches of the pairs, by the references' indices."""
-        ignored = IgnoredKeypoints(references, {pair: it.stationary for pair, it in pairs.items()}, options)
-        if not ignored:
-            return cls(ignored, {}, {})
-        masks = [ignored.of(it.view) for it in references]
-        # All pairs at once, which takes a fraction of the time.
-        counts = [len(it.agreeing) for it in pairs.values()]
-        matches = np.concatenate([it.agreeing for it in pairs.values()])
-        begin = np.repeat(keypoint_offsets(references)[np.array(list(pairs))], counts, axis=0)
-        kept = ~np.concatenate(masks)[matches + begin].any(axis=1)
-        ends = np.concatenate([[0], np.cumsum(kept)])[np.cumsum(counts)]
-        names = [(references[i].key, references[j].key) for i, j in pairs]
-        of_pairs = zip(names, np.split(matches[kept], ends[:-1]), strict=True)
-        return cls(ignored, {it.key: mask for it, mask in zip(references, masks, strict=True)}, dict(of_pairs))
-
-    @property
-    def size_bytes(self) -> int:
-        """Memory of the arrays, bytes; at least one."""
-        arrays = [*self.of_reference.values(), *self.pairs.values()]
-        return 1 + self.ignored.size_bytes + sum(it.nbytes for it in arrays)
-
-    def pair(self, first: PosedView, second: PosedView) -> Matches:
-        """The matches of two of the references, in this order."""
-        found = self.pairs.get((first.key, second.key))
-        return self.pairs[second.key, first.key][:, ::-1] if found is None else found
-
-
-def references_without_fixed(
-    references: Sequence[PosedView],
-    pairs: Mapping[tuple[int, int], PairMatches],
-    keys: frozenset[PairKey],
-    options: StationaryOptions,
-    cache: LruCache[object],
-) -> ReferencesWithoutFixed | None:
-    """Finds what is fixed to the cameras of references, by the matches of their pairs; None where no pair shows it.
-
-    The pairs are given by the references' indices; their keys determine their matches, and with them the cached result.
-    """
-    if not any(len(it.stationary) for it in pairs.values()):
-        return None
-    key = tuple(sorted(it.key for it in references)), keys, options
-    found = cache.get(key)
-    if not isinstance(found, ReferencesWithoutFixed):
-        found = ReferencesWithoutFixed.of(references, pairs, options)
-        cache.put(key, found, found.size_bytes)
-    return found
-
-
-def without_fixed(
-    query: View,
-    references: Sequence[PosedView],
-    pairs: Mapping[tuple[int, int], PairMatches],
-    query_matches: Sequence[Matches],
-    fixed: ReferencesWithoutFixed | None,
-) -> tuple[dict[tuple[int, int], Matches], tuple[Matches, ...], int]:
-    """The matches of pairs, and of a query with each reference, without keypoints that are fixed to the camera.
-
-    The third result is the number of the query's keypoints whose matches are left out.
-    """
-    if fixed is None or not fixed.ignored:
-        return {pair: it.agreeing for pair, it in pairs.items()}, tuple(query_matches), 0
-    of_pairs = {(i, j): fixed.pair(references[i], references[j]) for i, j in pairs}
-    of_query = fixed.ignored.of(query)
-    kept = tuple(
-        without_ignored(it, of_query, fixed.of_reference[reference.key])
-        for it, reference in zip(query_matches, references, strict=True)
-    )
-    before, after = (len(np.unique(np.concatenate(it)[:, 0])) for it in (query_matches, kept))
-    return of_pairs, kept, before - after
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +138,12 @@ class Matcher:
         found = {pair: matches for pair, (_, matches) in zip(pairs, made, strict=True)}
         if query_matches is None:
             query_matches = self.match_query(query, references, check)
-        keys, options = frozenset(key for key, _ in made), self.pairs.stationary
-        fixed = references_without_fixed(references, found, keys, options, self._structures)
-        of_pairs, matches, count = without_fixed(query, references, found, query_matches, fixed)
+        of_pairs, matches, count = {pair: it.agreeing for pair, it in found.items()}, tuple(query_matches), 0
+        if any(len(it.stationary) for it in found.values()):
+            keys, options = frozenset(key for key, _ in made), self.pairs.stationary
+            fixed = references_without_fixed(references, found, keys, options, self._structures)
+            if fixed.ignored:
+                of_pairs, matches, count = without_fixed(query, references, found, query_matches, fixed)
         # Strong matches of a pair may be stored at any time, so that its matches are not determined.
         source = MatchedReferences(tuple(references), self.pairs.name(matching), self._structures)
         known = source if self.pair_matching is None else None
@@ -422,43 +325,3 @@ class Matcher:
         gone = frozenset(keys)
         self.pairs.forget(gone)
         self._structures.forget(lambda key, _: not gone.isdisjoint(key[0]))
-
-
-def make_matcher(
-    features: str,
-    threads: int = 1,
-    weights: Path | None = None,
-    device: str = "cpu",
-) -> Matcher:
-    """Makes the matcher for an extractor.
-
-    Args:
-        features: one of `OPTIONS`.
-        threads: number of threads that a query's pairs are distributed over.
-        weights: weights of the features' LightGlue; None takes nearest neighbours alone. On a CUDA device LightGlue
-            matches the query; on a CPU, where it is slow, it is the `Matcher.pair_matching`.
-        device: "cpu" or a CUDA device, for LightGlue.
-
-    Raises:
-        ValueError: unknown name, or features without a LightGlue.
-        CheckpointError: the weights do not fit.
-        ImportError: a package that LightGlue needs is not installed.
-    """
-    if features not in OPTIONS:
-        raise ValueError(f"unknown features {features!r}; known: {', '.join(OPTIONS)}")
-    if weights is None:
-        return Matcher(OPTIONS[features], threads)
-    light_glue = make_light_glue(features, weights, device)
-    if device == "cpu":
-        return Matcher(OPTIONS[features], threads, pair_matching=light_glue)
-    return Matcher(OPTIONS[features], threads, light_glue)
-
-
-def make_light_glue(features: str, weights: Path, device: str = "cpu") -> "LightGlueMatching":
-    """Makes the LightGlue of an extractor; errors as in `make_matcher`."""
-    from mapless_server.networks.lightglue import load_lightglue
-
-    from ..features.lightglue import LightGlueMatching
-
-    network, sha256 = load_lightglue(features, weights)
-    return LightGlueMatching(network, device, sha256=sha256)

@@ -16,13 +16,7 @@ import numpy as np
 
 from mapless_server.cache import LruCache
 
-from ..features.matching import (
-    CorrespondOptions,
-    PairMatching,
-    StoredPairs,
-    best_of_both,
-    mutual_matches_of_ratios,
-)
+from ..features.matching import CorrespondOptions, PairMatching, StoredPairs, best_of_both, mutual_matches_of_ratios
 from ..features.views import Matches, PosedView
 from .agreement import pair_error_px, thinned
 from .epipolar import epipolar_distance_px, epipolar_distances_px
