@@ -101,7 +101,7 @@ def _check_among(request: pb.LocalizeRequest) -> None:
     keys = scene_keys_from_message(request, TENANT) if request.scenes else [key_of(TENANT, it) for it in "abcdef"]
     labels_from_message(request.scene_group.labels, "scene_group.labels")
     scenes = [
-        GroupedScene(key, 1, 0, partial(KINDS_OF_SCENES.__getitem__, i % len(KINDS_OF_SCENES)))
+        GroupedScene(1, 0, partial(KINDS_OF_SCENES.__getitem__, i % len(KINDS_OF_SCENES)), key)
         for i, key in enumerate(keys)
     ]
     found = questions_from_message(request, FoundScenes(scenes), TENANT, lambda _: np.ones(len(keys)))

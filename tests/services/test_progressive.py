@@ -16,8 +16,9 @@ from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.errors import Overloaded
 from mapless_server.rpc import Call
 from mapless_server.scheduling import AnyJob, Flow, Job, Step
-from mapless_server.services.localization import GiveBetter, LocalizationService, better_then_final
+from mapless_server.services.localization import LocalizationService
 from mapless_server.services.messages.answers import answer_frames_of
+from mapless_server.services.progressive import GiveBetter, better_then_final
 from mapless_server.services.rejected import Asked
 
 FINAL = pb.LocalizeResponse(localization=pb.Localization(inlier_count=100))

@@ -63,7 +63,7 @@ PART = Query(SceneKey("s0"), (), Photo(IMAGE, CAMERA, "image"), ANYWHERE, 2, Loc
 def found(*attributes: SceneAttributes) -> FoundScenes:
     """Scenes s0, s1, ... with these attributes."""
     return FoundScenes(
-        [GroupedScene(SceneKey(f"s{i}"), 1, 0, lambda it=it: it) for i, it in enumerate(attributes)]  # type: ignore[misc]
+        [GroupedScene(1, 0, lambda it=it: it, SceneKey(f"s{i}")) for i, it in enumerate(attributes)]  # type: ignore[misc]
     )
 
 

@@ -33,6 +33,7 @@ from .indexes import SceneIndexes
 from .later import CALIBRATION, LaterFeatures, Pending, Work, in_order, name_of, what_of
 from .library import Closed, ReferenceLibrary
 from .observer import BackgroundObserver
+from .pacing import Pace
 from .retrieval.ranking import rank_beside
 from .scene_agreements import SceneAgreements
 from .stored import PairFinder, TierMatching
@@ -44,7 +45,6 @@ _CACHE_BYTES = 64 * 2**20
 
 _WAITING_IS_COUNTED_S = 30.0
 _USE_IS_RECORDED_S = 3600.0
-_LOOK_S = 0.01
 _COMPLETE_SCENES = 10_000
 """Scenes of which is remembered in which generation nothing was left."""
 _LONGEST_END_S = 10.0
@@ -122,22 +122,19 @@ class BackgroundMatching:
         self._pairs = PairStore(store.database)
         self._indexes = indexes
         self._matchings = matchings
-        self._is_idle = is_idle
         self._observer = observer
         self._calibrations = work.calibrations
         self._depths = work.depths
         self._agreements = work.agreements
         self.options = options or BackgroundOptions()
+        self._pace = Pace(is_idle, self.options.busy_share)
         self._urgent, others = in_order(list(matchings), work.features)
         self._all = [*self._urgent, *others]
         self._progress = {it.name: Progress() for it in self._all}
-        self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._makes_pairs = False
         self._complete: LruCache[int] = LruCache(_COMPLETE_SCENES)
         self._rests_until_s: dict[Work, float] = {}
-        self._step_begin_s = 0.0
-        self._busy_s = -math.inf
         self._use_is_due_s = -math.inf
         self._counted_s = 0.0
         self._waiting_count = 0
@@ -161,7 +158,7 @@ class BackgroundMatching:
         A network that predicts depths on a CPU takes minutes, so the wait for it is limited, and its result is not
         stored.
         """
-        self._closing.set()
+        self._pace.closing.set()
         if self._thread is None:
             return
         self._thread.join(None if self._depths is None else _LONGEST_END_S)
@@ -171,16 +168,16 @@ class BackgroundMatching:
     def _match_and_calibrate(self) -> None:
         """Does what waits: what is urgent of new references, then depths, then calibrations, then the rest."""
         has_more = True
-        while has_more and not self._closing.is_set():
+        while has_more and not self._pace.closing.is_set():
             self._work_on(self._urgent)
             has_more = self._make_next_depth() or self._calibrate_next() or self._work_on(self._all, is_rest=True)
 
     def _make_next_depth(self) -> bool:
-        self._step_begin_s = time.monotonic()
+        self._pace.begin_step()
         return self._depths is not None and self._depths.make_next(self._wait_for_callers)
 
     def _calibrate_next(self, is_first: bool = False) -> bool:
-        self._step_begin_s = time.monotonic()
+        self._pace.begin_step()
         pause = partial(self._wait_for_callers, 0.0 if is_first else None)  # the first needs no idle time
         return self._calibrations is not None and self._calibrations.calibrate_next(pause, is_first)
 
@@ -193,7 +190,7 @@ class BackgroundMatching:
 
         With `is_rest` it returns after work that is urgent, with True, so that what follows that comes first.
         """
-        self._step_begin_s = time.monotonic()
+        self._pace.begin_step()
         found = self._claim(works)
         if found is None:
             if self._waiting_count:  # another server may have done it
@@ -203,7 +200,7 @@ class BackgroundMatching:
         # Of its own, so that references that queries use stay in memory.
         uncached = self._store.uncached(_CACHE_BYTES)
         with closing(ReferenceLibrary(uncached, locks=self._indexes.locks)) as library:
-            while found is not None and not self._closing.is_set():
+            while found is not None and not self._pace.closing.is_set():
                 self._work_on_claimed(library, *found)
                 if is_rest and found[0] in self._urgent:
                     return True
@@ -254,7 +251,7 @@ class BackgroundMatching:
 
     def _run(self, work: Callable[[], None]) -> None:
         poll_s = self.options.poll_s
-        while not self._closing.wait(poll_s):
+        while not self._pace.closing.wait(poll_s):
             next_s, poll_s = min(2 * poll_s, self.options.longest_poll_s), self.options.poll_s
             try:
                 work()
@@ -344,7 +341,7 @@ class BackgroundMatching:
         for reference_id in wanted:
             self._let_callers_first()
             # One pair at least, so that a busy server ends, too.
-            if self._closing.is_set() or (made and time.monotonic() > until_s):
+            if self._pace.closing.is_set() or (made and time.monotonic() > until_s):
                 return made, False
             try:
                 for other in self._indexes.load_existing(
@@ -382,7 +379,7 @@ class BackgroundMatching:
         return [id_of[key] for key in missing]
 
     def _check(self) -> None:
-        if self._closing.is_set():
+        if self._pace.closing.is_set():
             raise Closed
 
     def _wait_for_callers(self, quiet_s: float | None = None) -> None:
@@ -395,17 +392,5 @@ class BackgroundMatching:
         self._let_callers_first(1 / 30)
 
     def _let_callers_first(self, share_of_claim: float = 1 / 4, quiet_s: float | None = None) -> None:
-        """Ends a step: waits while the server computes for callers, as long as `busy_share` demands.
-
-        It waits at most this share of the time that a claim holds, so that the claim does not end meanwhile.
-        """
-        options, now_s = self.options, time.monotonic()
-        quiet_s = options.quiet_s if quiet_s is None else quiet_s
-        until_s = now_s + min((now_s - self._step_begin_s) / options.busy_share, CLAIM_S * share_of_claim)
-        while now_s < until_s:
-            if not self._is_idle():
-                self._busy_s = now_s
-            if (self._busy_s < now_s and now_s - self._busy_s >= quiet_s) or self._closing.wait(_LOOK_S):
-                break
-            now_s = time.monotonic()
-        self._step_begin_s = time.monotonic()
+        """Ends a step; waits at most this share of the time of a claim, which does not end meanwhile."""
+        self._pace.end_step(self.options.quiet_s if quiet_s is None else quiet_s, CLAIM_S * share_of_claim)

@@ -26,6 +26,7 @@ from mapless_server.store import IndexedReference, SceneChanges, Store
 from mapless_server.store.portions import IndexReader
 
 from .observer import BackgroundObserver
+from .pacing import Pace
 from .retrieval.index import Entries, GlobalDescriptor, SceneIndex
 from .retrieval.index_file import Header, Identity, IndexDamaged, IndexFile, NotThisIndex
 from .retrieval.index_writer import UNFINISHED, BeingMade, Content, Making, has_room, unfinished, write_index
@@ -39,7 +40,6 @@ Read = tuple[SceneIndex, Collection[str]]
 log = logging.getLogger(__name__)
 
 _PORTION = 2000
-_LOOK_S = 0.01
 _BEING_MADE_S = 10.0
 """Time between two looks whether another server has made a file."""
 
@@ -111,9 +111,8 @@ class IndexFiles:
         self._useless: dict[Path, tuple[int, int] | None] = {}
         self._rests_until_s: dict[SceneKey, float] = {}
         self._readers = ThreadPoolExecutor(max_workers=1, thread_name_prefix="large scenes")
-        self._closing = threading.Event()
+        self._pace = Pace(lambda: self.is_idle(), self.options.busy_share)
         self._thread: threading.Thread | None = None
-        self._step_begin_s = 0.0
 
     def open(self, scene_key: SceneKey) -> Read | None:
         """Opens the index of a scene, as it is in the store; None if there is no file that is certainly of it."""
@@ -148,7 +147,7 @@ class IndexFiles:
         state = self._reader.read_state(scene_key)
         index, damaged_ids = SceneIndex(self._descriptor.dimension), set[str]()
         for portion in self._portions(scene_key, damaged_ids):
-            if self._closing.is_set():
+            if self._pace.closing.is_set():
                 raise _Closing
             index.apply(SceneChanges(state.generation, portion, frozenset(), False))
         took_s = time.monotonic() - begin_s
@@ -179,7 +178,7 @@ class IndexFiles:
             return
         with self._lock:
             rests = time.monotonic() < self._rests_until_s.get(scene_key, 0.0)
-            if rests or scene_key in self._waiting or self._closing.is_set():
+            if rests or scene_key in self._waiting or self._pace.closing.is_set():
                 return
             self._waiting.add(scene_key)
             if self._thread is None:
@@ -201,7 +200,7 @@ class IndexFiles:
 
     def close(self) -> None:
         """Ends the thread after its current step; a file that it makes is given up."""
-        self._closing.set()
+        self._pace.closing.set()
         self._readers.shutdown(cancel_futures=True)
         self._wanted.put(None)
         if self._thread is not None:
@@ -238,7 +237,7 @@ class IndexFiles:
         return index, damaged_ids
 
     def _run(self) -> None:
-        while (wanted := self._wanted.get()) is not None and not self._closing.is_set():
+        while (wanted := self._wanted.get()) is not None and not self._pace.closing.is_set():
             scene_key, adopt = wanted
             try:
                 self._delete_abandoned()
@@ -292,7 +291,7 @@ class IndexFiles:
         if not has_room(self._folder, state.reference_count, self._descriptor.dimension):
             raise OSError(f"the disk of {self._folder} has too little room")
         damaged_ids = set[str]()
-        self._step_begin_s = time.monotonic()
+        self._pace.begin_step()
         content = Content(
             self._identity_of(scene_key, state.create_time_us),
             state.generation,
@@ -312,14 +311,9 @@ class IndexFiles:
 
     def _pause(self) -> None:
         """Ends a step: waits while the server computes for callers, as long as `busy_share` demands."""
-        if self._closing.is_set():
+        self._pace.end_step()
+        if self._pace.closing.is_set():
             raise _Closing
-        now_s = time.monotonic()
-        until_s = now_s + (now_s - self._step_begin_s) / self.options.busy_share
-        while not self.is_idle() and time.monotonic() < until_s:
-            if self._closing.wait(_LOOK_S):
-                raise _Closing
-        self._step_begin_s = time.monotonic()
 
     def _delete_abandoned(self) -> None:
         """Deletes files of scenes of this store that do not exist any more, and what killed processes have left."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
+from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -43,15 +43,13 @@ from .messages.priors import needs_attributes
 from .messages.queries import among, query_among, query_from_message
 from .messages.scenes import AskedScenes, allowed_from_message, names_several, questions_from_message
 from .photographs import Joint, localize_group
+from .progressive import GiveBetter, better_then_final
 from .reach import Reach
 from .rejected import Asked, may_be_beyond, name_outdated_place, searched_beyond
 from .watching import Watcher, Watchers
 
 if TYPE_CHECKING:  # services do not load what computes
     from mapless_server.engine.queue_engine import QueueEngine
-
-GiveBetter = Callable[[pb.LocalizeResponse], None]
-"""Receives an answer that is better than those before, while the final one is computed."""
 
 Offer = Callable[[pb.LocalizeOptions, Query, Result, Principal], pb.AdoptionOffer]
 """Receives an answered photograph, which may become a reference, and its caller; returns at once what becomes of it."""
@@ -399,24 +397,3 @@ def response_of(
     diagnostics.total_duration.FromNanoseconds(round(1e9 * (time.monotonic() - call.arrived_s)))
     diagnostics.processor_duration.FromNanoseconds(round(1e9 * sum(it.processor_s for it in records)))
     return response
-
-
-async def better_then_final(
-    answer: Callable[[GiveBetter], Coroutine[Any, Any, pb.LocalizeResponse]],
-) -> AsyncGenerator[pb.LocalizeProgressivelyResponse, None]:
-    """Yields each answer as soon as it is known, and then the final one.
-
-    `answer` returns the final one; before, it may give others to its argument, on the event loop. It is computed
-    whether the messages are read or not, so a slow reader delays only its own messages. Closing the generator cancels
-    the answer, and frees its place in the queue. Any exception of `answer` is raised after what was given before.
-    """
-    given: asyncio.Queue[pb.LocalizeResponse | None] = asyncio.Queue()
-    answering = asyncio.ensure_future(answer(given.put_nowait))
-    answering.add_done_callback(lambda _: given.put_nowait(None))
-    try:
-        while (better := await given.get()) is not None:
-            yield pb.LocalizeProgressivelyResponse(answer=better)
-        yield pb.LocalizeProgressivelyResponse(answer=answering.result(), is_final=True)
-    finally:
-        answering.cancel()
-        await asyncio.gather(answering, return_exceptions=True)

@@ -216,32 +216,18 @@ class SceneState:
 
 
 @dataclass(frozen=True, eq=False)
-class GroupedScene:
-    """One of the scenes that a query may search, as it was at one moment.
+class GroupedScene(SceneState):
+    """One of the scenes that a query may search, by its key; its attributes are without self-calibrations.
 
     While a scene does not change, the store returns the same object, so that its attributes are read once.
-
-    Attributes:
-        scene_key: its key.
-        generation: see `SceneRecord`.
-        create_time_us: see `SceneState`.
-        read: reads its attributes from what is stored; DataLoss if they are damaged.
     """
 
     scene_key: SceneKey
-    generation: int
-    create_time_us: int
-    read: Callable[[], SceneAttributes]
 
     @property
     def scene_id(self) -> str:
         """The scene's id within its tenant."""
         return scene_id_of(self.scene_key)
-
-    @cached_property
-    def attributes(self) -> SceneAttributes:
-        """Its attributes, without self-calibrations; DataLoss if they are damaged."""
-        return self.read()
 
 
 @dataclass(frozen=True, eq=False)

@@ -124,4 +124,4 @@ def _same_or_new(known: GroupedScene | None, row: Row[Any]) -> GroupedScene:
     """The scene of a row: the known one, if it has not changed since."""
     if known is not None and (known.generation, known.create_time_us) == (row.generation, row.create_time_us):
         return known
-    return GroupedScene(SceneKey(row.scene_id), row.generation, row.create_time_us, partial(rows.scene_attributes, row))
+    return GroupedScene(row.generation, row.create_time_us, partial(rows.scene_attributes, row), SceneKey(row.scene_id))

@@ -57,7 +57,7 @@ class ScenesOfCall:
 
     def find_scenes_named(self, scene_keys: Sequence[SceneKey]) -> NamedScenes:
         """The call's scene, and that of its priors."""
-        return NamedScenes(tuple(GroupedScene(it, 1, 0, partial(self._attributes_of, it)) for it in scene_keys), ())
+        return NamedScenes(tuple(GroupedScene(1, 0, partial(self._attributes_of, it), it) for it in scene_keys), ())
 
     def _attributes_of(self, scene_key: SceneKey) -> SceneAttributes:
         if scene_key == key_of(self._call.tenant, self._call.scene_id):
