@@ -13,8 +13,11 @@ import pytest
 from numpy.typing import NDArray
 from support.servers import listening
 
-from mapless import AdoptionPolicy, Client, NewReference, Rejected, RigImage, SequenceFrame
+from mapless import AdoptionPolicy, Client, IntrinsicsUncertainty, NewReference, Rejected, RigImage, SequenceFrame
+from mapless.geometry import Camera
+from mapless.lenses import RadialTangential
 from mapless_server.errors import DataLoss
+from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Refusal
 from mapless_server.security import SceneKey
 from mapless_server.serve.adoption import adopter as module
@@ -423,6 +426,50 @@ def test_a_camera_that_is_known_too_little_keeps_nothing(held: Held) -> None:
     held.client.update_scene("room", adoption=replace(POLICY, max_radius_m=0.002))
     answer = held.client.localize(query.data, None, "room", allow_adoption=True)
     assert answer.diagnostics.adoption == "UNCERTAIN"
+
+
+def _asked(held: Held, data: bytes, camera: Camera, said: IntrinsicsUncertainty) -> Candidate:
+    answer = held.client.localize(data, camera, "room", allow_adoption=True, intrinsics_uncertainty=said)
+    assert answer.diagnostics.adoption == "WAITING"
+    return held.taken()
+
+
+def test_a_caller_cannot_make_a_kept_pose_more_certain(held: Held) -> None:
+    """The focal length is 0.5 % wrong, and said to be right to 0.01 %."""
+    query, wrong = held.place.queries[0], 1.005
+    focal_px, other_px = (wrong * it for it in (query.camera.focal_x_px, query.camera.focal_y_px))
+    camera = replace(query.camera, focal_x_px=focal_px, focal_y_px=other_px)
+    candidate = _asked(held, query.data, camera, IntrinsicsUncertainty(focal_sigma_px=1e-4 * focal_px))
+    assert held.consider(candidate) is None
+    (kept,) = held.client.list_references("room", only_adopted=True)
+    error_m, _ = pose_error(query.world_from_camera, kept.world_from_camera)
+    assert kept.provenance.accuracy is not None
+    assert candidate.answered.position_95_m < error_m < kept.provenance.accuracy.position_95_m
+
+
+def test_a_wrong_lens_that_matches_correct_is_not_kept(held: Held) -> None:
+    """Its pose is right, and is that of another camera than the reference would have."""
+    query = held.place.queries[0]
+    camera = replace(query.camera, distortion=RadialTangential(k1=0.1))
+    candidate = _asked(held, query.data, camera, IntrinsicsUncertainty(k1_sigma=0.1))
+    error_m, _ = pose_error(query.world_from_camera, candidate.answered.world_from_camera)
+    assert error_m < candidate.answered.position_95_m
+    assert held.consider(candidate) is Refusal.UNSUPPORTED
+    estimated = replace(candidate.query.options, intrinsics=IntrinsicsSigma(k1=0.1))
+    assert held.consider(replace(candidate, query=replace(candidate.query, options=estimated))) is Refusal.UNSUPPORTED
+
+
+def test_a_stated_shutter_hides_no_warp(held: Held) -> None:
+    """References have global shutters: what moves by 24 px from top to bottom is none, whatever explains it."""
+    query = held.place.queries[0]
+    pixels = _pixels(query)
+    height, width = pixels.shape[:2]
+    shear = np.array([[1, 24 / height, -12], [0, 1, 0]])
+    warped = cv2.warpAffine(pixels, shear, (width, height), borderMode=cv2.BORDER_REFLECT)
+    _, jpeg = cv2.imencode(".jpg", warped, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    candidate = _asked(held, jpeg.tobytes(), query.camera, IntrinsicsUncertainty(readout_s=0.1))
+    assert held.consider(candidate) is not None
+    assert held.adopted == []
 
 
 def test_an_answer_says_why_nothing_is_kept(held: Held, monkeypatch: pytest.MonkeyPatch) -> None:

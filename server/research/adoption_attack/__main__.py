@@ -9,9 +9,11 @@ after. Prints Markdown: what became of the attacker's, and by how much the answe
 
 import argparse
 import asyncio
+import math
 import shutil
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -98,17 +100,19 @@ def _off_m(true: RigidTransform, found: Evidence) -> float:
     return pose_error(true, found.world_from_camera)[0]
 
 
-async def attack(server: Attacked, photographs: Sequence[Sent]) -> tuple[Counter[str], int, int]:
-    """Sends an attack; counts what became of it, those localized, and wrong answers."""
+async def attack(server: Attacked, photographs: Sequence[Sent], until_s: float) -> tuple[Counter[str], int, int]:
+    """Sends an attack, until `until_s` of the monotonic clock; counts what became of it, those localized, and wrong."""
     reasons, localized, wrong = Counter[str](), 0, 0
     for i, it in enumerate(photographs):
+        if time.monotonic() > until_s:
+            break
         server.clock.day = it.day
         answered, reason = await server.send(it.path.read_bytes(), it.camera)
         reasons[reason] += 1
         if answered is not None:
             localized += 1
             wrong += is_wrong(it.world_from_camera, answered)
-        if i % 50 == 49:
+        if i % 10 == 9:
             print(i + 1, localized, wrong, dict(reasons), file=sys.stderr, flush=True)
     return reasons, localized, wrong
 
@@ -137,12 +141,13 @@ async def measure(
 ) -> Outcome:
     """An attack on a fresh server; the answers to the views before any attack are added to `before` if it is empty."""
     views = read_folder(arguments.room / "step-00").frames[: arguments.views]
+    until_s = time.monotonic() + 60 * arguments.minutes
     with tempfile.TemporaryDirectory(prefix="mapless-") as data:
         shutil.copytree(arguments.folder / "surveyed", data, dirs_exist_ok=True)
         async with attacked(Path(data)) as server:
             first = [] if arguments.first is None else await true_ones_first(server, arguments.first)
             before.extend([] if before else await answers(server, views))
-            reasons, localized, wrong = await attack(server, photographs)
+            reasons, localized, wrong = await attack(server, photographs, until_s)
             shifts, lost, gained, off_m = compared(before, await answers(server, views))
             adopted = [it async for it in server.client.list_references(SCENE, only_adopted=True)]
             retired = [it async for it in server.client.list_references(SCENE, only_retired=True)]
@@ -153,7 +158,7 @@ async def measure(
             )
             kept = len({it.reference_id for it in adopted} & set(first))
     return Outcome(
-        kind, len(photographs), localized, wrong, reasons, off, (len(adopted), len(first), kept),
+        kind, reasons.total(), localized, wrong, reasons, off, (len(adopted), len(first), kept),
         tuple(shifts), lost, gained, off_m, (len(retired), outdated),
     )  # fmt: skip
 
@@ -165,6 +170,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--kind", nargs="+", choices=KINDS, default=["poster"])
     parser.add_argument("--photographs", type=int, default=1000, help="of each kind")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="each attack ends after so many at the latest")
     parser.add_argument("--views", type=int, default=40, help="photographs that are localized before and after")
     parser.add_argument("--first", type=Path, help="folder of true photographs that are adopted before")
     parser.add_argument("--seed", type=int, default=0, help="of the room")

@@ -21,6 +21,7 @@ DEVELOPED = 5
 """Photographs of each station: the attacker's phone exposes them differently."""
 DAYS = 20
 """Days of the slow attack; on each the pictures hang 2 cm further."""
+TILE_PX = 64
 Pixels = NDArray[np.uint8]
 
 
@@ -171,6 +172,39 @@ def _with_patch(render: Callable[[], Pixels], seed: Sequence[int]) -> Pixels:
     return pixels
 
 
+def siege(rooms: Rooms, count: int, factor: float, shift_px: int) -> Iterator[Fake]:
+    """As `flood`, for days, so that all places fill; the focal length or a half of each is as wrong as may pass."""
+    stated = replace(CAMERA, focal_x_px=CAMERA.focal_x_px * factor, focal_y_px=CAMERA.focal_y_px * factor)
+    places = visit(rooms.seed + 80, 0, count, rooms.surveyed)
+    for i, it in enumerate(taken([rooms.surveyed], places, count)):
+        render = partial(_with_half, it.render, it.render, shift_px)
+        yield Fake(it.station, partial(_with_patch, render, [rooms.seed, i]), stated, i)
+
+
+def scrambled(rooms: Rooms, count: int) -> Iterator[Fake]:
+    """True photographs, of which all but a strip is tiles of one of four others, shuffled: they resemble those."""
+    places = visit(rooms.seed, 0, count, rooms.surveyed)
+    photographs = list(taken([rooms.surveyed], places, count))
+    for i, it in enumerate(photographs):
+        other = photographs[i % 4 * (count // 4)]
+        yield it._replace(render=partial(_with_tiles, it.render, other.render, [rooms.seed, i]), day=i)
+
+
+def _with_tiles(render: Callable[[], Pixels], render_other: Callable[[], Pixels], seed: Sequence[int]) -> Pixels:
+    """A photograph with all but its left third, or its right one, replaced by tiles of another one, shuffled."""
+    random, pixels, other = np.random.default_rng(seed), render().copy(), render_other()
+    height, width = (side // TILE_PX for side in pixels.shape[:2])
+    tiles = [
+        other[TILE_PX * y : TILE_PX * (y + 1), TILE_PX * x : TILE_PX * (x + 1)]
+        for y, x in random.permutation([*np.ndindex(height, width)]).tolist()
+    ]
+    first = random.integers(0, 2) * (width // 3)
+    for i, (y, x) in enumerate(np.ndindex(height, width - width // 3)):
+        at_x = TILE_PX * (first + x)
+        pixels[TILE_PX * y : TILE_PX * (y + 1), at_x : at_x + TILE_PX] = tiles[i]
+    return pixels
+
+
 def true(rooms: Rooms, count: int) -> Iterator[Fake]:
     """True photographs, to compare with."""
     yield from taken([rooms.surveyed], visit(rooms.seed + 90, 0, places_for(count), rooms.surveyed), count)
@@ -191,6 +225,10 @@ KINDS: dict[str, Kind] = {
     "focal-102": partial(focal, factor=1.02),
     "drift": drift,
     "flood": flood,
+    "siege": partial(siege, factor=1.0, shift_px=0),
+    "siege-focal": partial(siege, factor=1.01, shift_px=0),
+    "siege-edited": partial(siege, factor=1.0, shift_px=3),
+    "scrambled": scrambled,
     "true": true,
 }
 """By name: the number is of centimetres, pixels or per cent."""

@@ -28,7 +28,7 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal, SceneKey
 from mapless_server.store import NewReference, Store, adoption, time_us
 
-from .evidence import distance_shown, inliers_px, kept_query, keypoints_px, rival_count
+from .evidence import distance_shown, evidence_as_kept, inliers_px, kept_query, keypoints_px, rival_count
 from .keeping import Keeper, guarded
 from .surveyed import Place, SurveyedLocalizer
 from .waiting import Candidate, Waiting
@@ -83,7 +83,8 @@ class Adopter:
             return pb.ADOPTION_OFFER_NOT_LOCALIZED
         if policy is None:
             return pb.ADOPTION_OFFER_SCENE_ADOPTS_NOTHING
-        evidence, kept = self._localizer.evidence(query, result), kept_query(query, result, policy)
+        coverage = self._engine.options.coverage
+        evidence, kept = self._localizer.evidence(query, result), kept_query(query, result, policy, coverage)
         if evidence is None or kept is None:
             self._observer.count_in_scene(result.scene_key, "adoptions", 1, "uncertain")
             return pb.ADOPTION_OFFER_UNCERTAIN
@@ -146,7 +147,7 @@ class Adopter:
         if place is None:
             return self._counted(scene_key, rules.Refusal.CHANGED)
         result = await self._localizer.localized(candidate.query, place.surveyed_ids, candidate.query.photo.mask)
-        surveyed = self._localizer.evidence(candidate.query, result)
+        surveyed = evidence_as_kept(candidate.query, result)
         is_outdated = await self._keeper.learn(candidate, place, surveyed, policy, self._now(), options)
         refused = rules.refusal(policy, candidate.answered, surveyed, options)
         if refused is None and is_outdated:

@@ -8,9 +8,10 @@ from mapless.geometry import Array
 from mapless.names import parse_reference_name
 from mapless.scenes import AdoptionPolicy
 from mapless_server.engine.group_cameras import read_with
-from mapless_server.engine.query import Query, Result
+from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Query, Result
 from mapless_server.method.bundle.estimate import PosedSupport
 from mapless_server.method.judge.answer import Localization
+from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pose.pnp import MIN_MATCHES, PnpOptions, ransac
 from mapless_server.scenes.adoption.policy import Evidence, camera_error_m
 from mapless_server.services.messages.answers import radii_of, used_camera
@@ -42,13 +43,33 @@ def evidence_of(query: Query, result: Result) -> Evidence | None:
     )
 
 
-def kept_query(query: Query, result: Result, policy: AdoptionPolicy) -> Query | None:
-    """The query as it is asked again, in the scene of its answer alone and with the camera that this reports.
+def evidence_as_kept(query: Query, result: Result) -> Evidence | None:
+    """The evidence of a kept photograph; None, too, if its pose is with another camera than it is kept with.
 
-    None where that camera is estimated and not known well enough for the policy.
+    That is so where its matches contradict the intrinsics that its caller stated.
+    """
+    camera = used_camera(result, query.options, query.photo)
+    return evidence_of(query, result) if camera is not None and camera.camera == query.photo.camera else None
+
+
+def kept_query(query: Query, result: Result, policy: AdoptionPolicy, coverage: float) -> Query | None:
+    """The query as it is asked again: in the scene of its answer alone, and as references are used.
+
+    These have the camera that is stated, or that the answer reports, a global shutter, and no depth. What else the
+    caller chose, as fewer references or radii that the scene does not calibrate, counts for its answer alone;
+    `coverage` is the server's. None where an estimated camera is not known well enough for the policy.
     """
     assert result.scene_key is not None
-    kept = replace(query, photo=replace(query.photo, depth=None), scene_key=result.scene_key, scenes=(), is_part=False)
+    kept = replace(
+        query,
+        photo=replace(query.photo, depth=None),
+        scene_key=result.scene_key,
+        scenes=(),
+        is_part=False,
+        reference_count=DEFAULT_REFERENCE_COUNT,
+        options=LocalizeOptions(coverage=coverage),
+        is_generic=False,
+    )
     if query.photo.exif is None:
         return kept
     camera = used_camera(result, query.options, query.photo)
