@@ -18,7 +18,7 @@ from mapless.geometry import Camera
 from mapless.lenses import RadialTangential
 from mapless_server.errors import DataLoss
 from mapless_server.method.bundle.priors import IntrinsicsSigma
-from mapless_server.scenes.adoption.policy import AdoptionOptions, Refusal
+from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
 from mapless_server.security import SceneKey
 from mapless_server.serve.adoption import adopter as module
 from mapless_server.serve.adoption import waiting
@@ -198,6 +198,39 @@ def test_a_flood_by_one_token_makes_nothing_useless(held: Held) -> None:
         held.consider(foreign)
     (only,) = adoption.list_adopted(held.store.database, ROOM)
     assert only.usefulness == pytest.approx(0.8 * 0.9)
+
+
+def _learned(held: Held, candidate: Candidate, surveyed: Evidence | None, day: int) -> None:
+    """Counts what a photograph says of its place on a day, where the survey alone localizes it so."""
+    options, now = AdoptionOptions(), datetime.now(timezone.utc) + timedelta(days=day)
+    pose, distance_m = candidate.answered.world_from_camera, candidate.distance_m
+    place = held.adopter._localizer.place(ROOM, pose, distance_m, options)
+    assert place is not None
+    learning = held.adopter._keeper.learn(candidate, place, surveyed, POLICY, now, options)
+    asyncio.run_coroutine_threadsafe(learning, held.loop).result(60)
+
+
+def test_ones_own_photographs_keep_no_place_full(held: Held) -> None:
+    """What one token put there is only proved useful by photographs of others; a new one is worth 0.2."""
+    robot = replace(held.candidate(held.place.queries[0]), holder="robot")
+    assert held.consider(robot) is None
+    (only,) = adoption.list_adopted(held.store.database, ROOM)
+    found = replace(robot.answered, inliers_of={only.reference_id: robot.answered.inlier_count})
+    for day, holder in enumerate(["robot"] * 4 + ["other"] * 4, 1):
+        _learned(held, replace(robot, holder=holder, answered=found), robot.answered, day)
+        (only,) = adoption.list_adopted(held.store.database, ROOM)
+        assert (only.usefulness > 0.2) is (holder == "other")
+
+
+def test_an_answer_from_the_survey_alone_shows_that_it_is_there(held: Held) -> None:
+    """Also where it needs the call's priors, without which the survey does not suffice."""
+    candidate = held.candidate(held.place.queries[0])
+    with_another = {**candidate.answered.inliers_of, "adopted": 1}
+    adopted = replace(candidate, answered=replace(candidate.answered, inliers_of=with_another))
+    for day, (its, mean) in enumerate([(candidate, 1.0), (adopted, 0.5)]):
+        _learned(held, its, None, day)
+        (first, *_) = [it.place for it in held.client.list_references("room") if it.place is not None]
+        assert first.surveyed_share == mean
 
 
 def _pixels(photograph: Photograph) -> NDArray[np.uint8]:

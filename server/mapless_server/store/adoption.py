@@ -112,7 +112,14 @@ def list_adopted(database: Database, scene_key: SceneKey) -> list[Adopted]:
     )
     with database.read() as connection:
         return [
-            Adopted(it.reference_id, it.reference_key, it.place_key, it.usefulness, it.retire_time_us is not None)
+            Adopted(
+                it.reference_id,
+                it.reference_key,
+                it.place_key,
+                it.usefulness,
+                it.retire_time_us is not None,
+                it.adopted_by,
+            )
             for it in connection.execute(statement)
         ]
 

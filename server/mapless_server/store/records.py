@@ -113,6 +113,7 @@ class Adopted:
         place_key: key of the surveyed reference that is nearest; empty if unknown.
         usefulness: share of what photographs of its place matched that it gave, a running mean, 0 to 1.
         is_retired: whether it is not chosen any more.
+        adopted_by: by whom and on which day, see `NewReference`.
     """
 
     reference_id: str
@@ -120,6 +121,7 @@ class Adopted:
     place_key: str
     usefulness: float
     is_retired: bool
+    adopted_by: str = ""
 
 
 @dataclass(frozen=True)

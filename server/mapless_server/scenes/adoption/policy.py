@@ -283,6 +283,15 @@ def is_contradicted(standing: Standing, options: AdoptionOptions) -> bool:
     return is_often and _are_enough(standing.contradicted_by, options)
 
 
-def with_usefulness(usefulness: float, share: float, options: AdoptionOptions) -> float:
-    """Usefulness of an adopted reference after a photograph of its place that has this share of matches with it."""
-    return usefulness + (share - usefulness) / options.remembered
+def with_usefulness(usefulness: float, share: float, options: AdoptionOptions, *, is_own: bool = False) -> float:
+    """Usefulness of an adopted reference after a photograph of its place that has this share of matches with it.
+
+    One of the holder for whom it was adopted, `is_own`, makes it no more useful than it was at first.
+    """
+    worth = min(share, options.first_usefulness) if is_own else share
+    return usefulness + (worth - usefulness) / options.remembered
+
+
+def is_adopted_for(adopted_by: str, holder: str) -> bool:
+    """Whether a reference was adopted for a holder, see `adopter_of`; never for one who may change the scene."""
+    return bool(holder) and adopted_by.partition(":")[2] == holder

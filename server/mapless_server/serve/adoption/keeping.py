@@ -121,8 +121,10 @@ class Keeper:
         Returns whether its own is outdated.
         """
         database, answered, scene_key = self._store.database, candidate.answered, candidate.query.scene_key
-        share, now_us = rules.surveyed_share(answered, surveyed), time_us(now)
-        counted = set[str]()
+        counted, now_us = set[str](), time_us(now)
+        if surveyed is None and answered.inliers_of.keys() <= set(place.surveyed_ids):
+            surveyed = answered  # with priors, depth or options of its call the survey alone sufficed
+        share = rules.surveyed_share(answered, surveyed)
 
         def learned(key: str, known: Standing) -> Standing:
             # Once outdated it stays so until a new survey: answers by what is left of the old one say nothing.
@@ -148,12 +150,12 @@ class Keeper:
             return True
         if candidate.holder and place.key not in counted:  # else one token could have useful ones leave
             return False
-        total = max(answered.inlier_count, 1)
-        useful = {
-            it.key: rules.with_usefulness(it.usefulness, answered.inliers_of.get(it.reference_id, 0) / total, options)
-            for it in adopted
-            if it.place_key == place.key
-        }
+        useful, total = dict[str, float](), max(answered.inlier_count, 1)
+        for it in adopted:
+            if it.place_key == place.key:
+                is_own = rules.is_adopted_for(it.adopted_by, candidate.holder)
+                given = answered.inliers_of.get(it.reference_id, 0) / total
+                useful[it.key] = rules.with_usefulness(it.usefulness, given, options, is_own=is_own)
         await asyncio.to_thread(adoption.set_usefulness, database, useful)
         return False
 
