@@ -45,6 +45,7 @@ from mapless_server.store import (
     SceneRecord,
     adoption,
     codec,
+    counts,
     restoring,
     rows,
 )
@@ -135,6 +136,8 @@ class WatchfulEngine:
 
 class WatchfulStore:
     """Has whatever it is asked for, keeps nothing, and looks at what it is given."""
+
+    database = None
 
     def list_alike(self, key: SceneKey, *_: object) -> list[ReferenceRecord]:
         check_key(key)
@@ -269,6 +272,11 @@ def _outdated(service: reference_service.ReferenceService, key: SceneKey) -> dic
     return {}
 
 
+def _numbers(database: object, key: SceneKey) -> counts.ReferenceNumbers:
+    check_key(key)
+    return counts.ReferenceNumbers(2, 1)
+
+
 def _is_adopted(service: reference_service.ReferenceService, key: SceneKey, reference_id: str) -> bool:
     check_key(key)
     check_id(reference_id)
@@ -277,6 +285,7 @@ def _is_adopted(service: reference_service.ReferenceService, key: SceneKey, refe
 
 _OF_DATABASES: tuple[tuple[Any, str, Any], ...] = (
     (adoption, "retire_by_operator", _retire),
+    (counts, "count_references", _numbers),
     (restoring, "restore", _restore),
     (restoring, "restore_reference", _restore_reference),
     (reference_service, "scene_report", _report),

@@ -224,13 +224,27 @@ def scene_from_message(message: reference_pb.Scene, response: Any = None) -> Sce
     return read(Scene, message, scene_id=scene_id, labels=labels, **found)
 
 
-_SAID_OF_SCENES = "warnings", "contradiction", "compared_pair_count", "agreeing_pair_count"
+_SAID_OF_SCENES = (
+    "warnings",
+    "contradiction",
+    "compared_pair_count",
+    "agreeing_pair_count",
+    "adopted_reference_count",
+    "retired_reference_count",
+)
 
 
 def reference_from_message(message: reference_pb.Reference, warnings: Iterable[str] = ()) -> Reference:
     """A reference, and what was found when it was added."""
     scene_id, reference_id = names.parse_reference_name(message.name)
     camera = wire.camera_from_message(message.intrinsics, "intrinsics")
+    place = message.place_reference
     return read(
-        Reference, message, scene_id=scene_id, reference_id=reference_id, camera=camera, warnings=tuple(warnings)
+        Reference,
+        message,
+        scene_id=scene_id,
+        reference_id=reference_id,
+        camera=camera,
+        warnings=tuple(warnings),
+        place_reference=names.parse_reference_name(place)[1] if place else "",
     )

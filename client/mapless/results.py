@@ -55,7 +55,10 @@ class Scene:
             do not agree with their poses; empty if it does not, or is not known to. Of `get_scene` alone.
         compared_pair_count: pairs of references that show enough in common to be compared with their poses.
         agreeing_pair_count: how many of these agree with them.
-        pending_work: what the server has still to make of its references in the background; of `get_scene` alone.
+        pending_work: what the server has still to make of its references in the background; of `get_scene` alone, as
+            the next two.
+        adopted_reference_count: number of adopted references that are in use.
+        retired_reference_count: number of references that are retired, surveyed and adopted ones.
     """
 
     scene_id: str
@@ -73,6 +76,8 @@ class Scene:
     compared_pair_count: int = 0
     agreeing_pair_count: int = 0
     pending_work: tuple[PendingWork, ...] = ()
+    adopted_reference_count: int = 0
+    retired_reference_count: int = 0
 
 
 @dataclass(frozen=True)
@@ -82,12 +87,14 @@ class PlaceState:
     Attributes:
         surveyed_share: share of their matches that surveyed references supported, 0 to 1, a running mean.
         photograph_count: photographs of the place, see `PlaceReport`.
-        contradiction_count: photographs in a row that should show what this reference shows, and do not.
+        contradiction_count: photographs in a row that should show what the surveyed reference shows, and do not.
+        is_outdated: whether they show too little of what was surveyed, so that the place needs a new survey.
     """
 
     surveyed_share: float
     photograph_count: int
     contradiction_count: int
+    is_outdated: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +118,9 @@ class Reference:
         provenance: how its pose is known.
         retire_time: when the server retired it, so that it is chosen no more; None if it is not retired.
         retirement: why, one sentence for a person; empty if it is not retired.
-        place: what photographs showed that were considered for adoption; None where there were none.
+        place: what photographs showed of its place that were considered for adoption; None where there were none.
+        place_reference: of an adopted one, the id of the surveyed reference whose place it is at; empty if that one is
+            not known or was deleted. Of others empty.
     """
 
     scene_id: str
@@ -131,6 +140,7 @@ class Reference:
     retire_time: datetime | None = None
     retirement: str = ""
     place: PlaceState | None = None
+    place_reference: str = ""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The commands by which an operator turns adoption on, sees what was adopted and retired, and undoes it."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
@@ -55,6 +56,8 @@ def test_adopted_references_are_shown_and_undone(run: Run, client: Client, scene
     assert [line.split()[:3] for line in text.splitlines()[1:]] == [["new", "50", "%"]]
     assert "r0, r1" in text
     assert "references  4 (1 adopted)\n" in run("scene", "get", scene)[1]
+    found = json.loads(run("scene", "get", scene, "--json")[1])
+    assert (found["adopted_reference_count"], found["retired_reference_count"]) == (1, 0)
     shown = run("reference", "show", scene, "new")[1]
     for said in ("adopted from a localized photograph, within 0.02 m (95 %)", "50 % of its matches", "r0 ", ", r1 "):
         assert said in shown

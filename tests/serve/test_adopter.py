@@ -257,6 +257,17 @@ def test_without_its_vouchers_an_adopted_reference_retires(held: Held) -> None:
     assert "were deleted or retired" in retired.retirement
 
 
+def test_a_place_without_its_surveyed_reference_is_another(held: Held) -> None:
+    assert held.consider(held.candidate(held.place.queries[0])) is None
+    (name,) = held.adopted
+    place = held.client.get_reference("room", name).place_reference
+    assert place in {it.name for it in held.place.references[::2]}
+    held.client.delete_reference("room", place)
+    assert held.client.get_reference("room", name).place_reference == ""
+    held.maintain()
+    assert held.client.get_reference("room", name).place_reference not in ("", place)
+
+
 def test_what_was_adopted_is_deleted_by_its_age(held: Held) -> None:
     assert held.consider(held.candidate(held.place.queries[0])) is None
     held.maintain()

@@ -115,6 +115,7 @@ async def test_vouchers_are_looked_up_after_changes_only(monkeypatch: pytest.Mon
     monkeypatch.setattr(adoption, "list_expired", lambda *_: [])
     monkeypatch.setattr(adoption, "list_adopting_scenes", lambda _: dict(generations))
     monkeypatch.setattr(adoption, "unvouched", looked_up)
+    monkeypatch.setattr(adoption, "list_unplaced", lambda *_: [])
     monkeypatch.setattr(adoption, "list_outdated_scenes", lambda _: {})
     stored = cast(Store, SimpleNamespace(database=None))
     its = adopter.Adopter(cast(QueueEngine, None), stored, cast(BackgroundObserver, None), 24.0)

@@ -199,6 +199,23 @@ def test_all_references_of_a_page_may_be_retired(client: Client, server: Running
     assert [it.verdict for it in client.audit_scene(scene)] == ["RETIRED"] * 3
 
 
+def test_an_adopted_reference_shows_its_place(client: Client, server: RunningServer, adopting: str) -> None:
+    new = client.add_reference(adopting, NewReference("new", PHOTO, CAMERA, pose(5.0), provenance=ADOPTED))
+    assert (new.place_reference, new.place) == ("", None)
+    database, state = store_of(server).database, PlaceState(0.4, 5, 0)
+    keys = {it: key_of(server, adopting, it) for it in ("new", "r1")}
+    adoption.set_places(database, {keys["new"]: keys["r1"]})
+    adoption.change_standings(database, [keys["r1"]], lambda _, it: replace(it, surveyed_share=0.4, photograph_count=5))
+    found = {it.reference_id: it for it in client.list_references(adopting)}
+    assert (found["new"].place_reference, found["new"].place) == ("r1", state)
+    assert (found["r1"].place_reference, found["r1"].place) == ("", state)
+    client.retire_reference(adopting, "new")
+    found["new"] = client.get_reference(adopting, "new")
+    assert (found["new"].place_reference, found["new"].place) == ("r1", state)
+    scene = client.get_scene(adopting)
+    assert (scene.adopted_reference_count, scene.retired_reference_count) == (0, 1)
+
+
 def test_places_that_need_a_new_survey_are_named(client: Client, server: RunningServer, adopting: str) -> None:
     key = key_of(server, adopting, "r2")
     adoption.change_standings(
@@ -209,7 +226,7 @@ def test_places_that_need_a_new_survey_are_named(client: Client, server: Running
     _, warning = client.get_scene(adopting).warnings
     assert warning.startswith("photographs around r2 at (2.00, 2.00, -1.00) show too little of what was surveyed")
     places = {it.reference_id: it.place for it in client.list_references(adopting)}
-    assert places == {"r0": None, "r1": None, "r2": PlaceState(0.2, 5, 0)}
+    assert places == {"r0": None, "r1": None, "r2": PlaceState(0.2, 5, 0, is_outdated=True)}
     assert adoption.read_standings(store_of(server).database, [key])[key].photograph_count == 5
 
 

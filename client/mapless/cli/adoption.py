@@ -143,8 +143,8 @@ def adopted_table(references: list[Reference]) -> list[str]:
         vouchers = ", ".join(one.reference_id for one in it.provenance.vouchers[:3])
         share = f"{100 * it.provenance.surveyed_share:.0f} %"
         adopted = it.provenance.adopt_time or it.create_time
-        rows.append((it.reference_id, share, vouchers, f"{adopted:%Y-%m-%d %H:%M}", _retired(it)))
-    return table(("REFERENCE", "SURVEYED", "VOUCHERS", "ADOPTED", "RETIRED ON"), rows)
+        rows.append((it.reference_id, it.place_reference, share, vouchers, f"{adopted:%Y-%m-%d %H:%M}", _retired(it)))
+    return table(("REFERENCE", "PLACE OF", "SURVEYED", "VOUCHERS", "ADOPTED", "RETIRED ON"), rows)
 
 
 def _retired(it: Reference) -> str:
@@ -160,7 +160,13 @@ def places_table(references: list[Reference]) -> list[str]:
     """A table of the places that photographs were considered of, those with the least survey left first."""
     seen = [(it.place, it.reference_id) for it in references if it.place is not None]
     rows = [
-        (name, f"{100 * it.surveyed_share:.0f} %", it.photograph_count, it.contradiction_count)
+        (
+            name,
+            f"{100 * it.surveyed_share:.0f} %",
+            it.photograph_count,
+            it.contradiction_count,
+            "outdated" if it.is_outdated else "",
+        )
         for it, name in sorted(seen, key=lambda both: (both[0].surveyed_share, both[1]))
     ]
-    return table(("PLACE OF", "SURVEY LEFT", "PHOTOGRAPHS", "CONTRADICTIONS"), rows)
+    return table(("PLACE OF", "SURVEY LEFT", "PHOTOGRAPHS", "CONTRADICTIONS", ""), rows)

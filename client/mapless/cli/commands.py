@@ -4,7 +4,6 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from ..results import PlaceState, Reference, Scene, summary_of
 from .adoption import adopted_table, places_table, policy_of, policy_text, retired_table
 from .folder import EXIT_FAILED, EXIT_REJECTED
 from .localize import depth_of, limits
-from .output import card, is_confirmed, is_json, plain, serving_states, show, table
+from .output import card, is_confirmed, plain, serving_states, show, table
 
 _BLANK = "nothing can be matched with it; it is blank, dark or blurred"
 
@@ -99,27 +98,16 @@ def get_scene(client: Client, arguments: argparse.Namespace) -> int:
     """Prints a scene with its datum and calibration."""
     scene = client.get_scene(arguments.scene)
     _warn(scene.warnings)
-    text = [] if is_json(arguments) else _scene_card(scene, _kinds(client, arguments.scene))
-    return show(arguments, scene, text)
+    return show(arguments, scene, _scene_card(scene))
 
 
-_MOST_COUNTED = 1000
-
-
-def _kinds(client: Client, scene: str) -> str:
-    """How many references of a scene were adopted or are retired, for a person; empty without any."""
-    found = list[str]()
-    for kind, wanted in (("adopted", {"only_adopted": True}), ("retired", {"only_retired": True})):
-        count = sum(1 for _ in islice(client.list_references(scene, **wanted), _MOST_COUNTED))
-        found += [f"{count}{' or more' if count == _MOST_COUNTED else ''} {kind}"] if count else []
-    return f" ({', '.join(found)})" if found else ""
-
-
-def _scene_card(scene: Scene, kinds: str = "") -> list[str]:
+def _scene_card(scene: Scene) -> list[str]:
     down, calibration = scene.down_in_world, scene.calibration
+    counts = {"adopted": scene.adopted_reference_count, "retired": scene.retired_reference_count}
+    kinds = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
     return card(
         scene=scene.scene_id,
-        references=f"{scene.reference_count}{kinds}",
+        references=f"{scene.reference_count}" + (f" ({kinds})" if kinds else ""),
         unit=_unit(scene),
         datum=f"{_place(scene.datum)}, {scene.datum.height_m:.2f} m" if scene.datum else None,
         down=None if down is None else " ".join(f"{it:.4f}" for it in down),
@@ -198,7 +186,7 @@ def list_references(client: Client, arguments: argparse.Namespace) -> int:
     wanted = {"only_adopted": arguments.adopted, "only_retired": arguments.retired}
     references = list(client.list_references(arguments.scene, **wanted))
     if arguments.places:
-        seen = [it for it in references if it.place is not None]
+        seen = [it for it in references if it.place is not None and it.provenance.source != ADOPTED]
         return show(arguments, seen, places_table(seen))
     if arguments.adopted or arguments.retired:
         text = adopted_table(references) if arguments.adopted else retired_table(references)
@@ -233,7 +221,7 @@ def _reference_card(it: Reference, unit: str = "m") -> list[str]:
         pose=_pose_of(it.provenance, unit),
         surveyed=f"{100 * it.provenance.surveyed_share:.0f} % of its matches" if it.provenance.vouchers else None,
         vouchers=", ".join(f"{one.reference_id} {one.match_count}" for one in it.provenance.vouchers) or None,
-        place=None if it.place is None else _state_of(it.place),
+        place=_place_of(it),
         retired=it.retirement.removeprefix("retired on ") or None,
         depth=_depth_of(it),
         features=it.feature_count,
@@ -259,9 +247,15 @@ def _pose_of(provenance: Provenance, unit: str) -> str:
     return source if accuracy is None else f"{source}, within {accuracy.position_95_m:.3g} {unit} (95 %)"
 
 
+def _place_of(it: Reference) -> str | None:
+    known = [f"of {it.place_reference}"] * bool(it.place_reference)
+    return ": ".join(known + ([] if it.place is None else [_state_of(it.place)])) or None
+
+
 def _state_of(place: PlaceState) -> str:
-    left = f"{100 * place.surveyed_share:.0f} % of the survey left"
-    return f"{left}, by {place.photograph_count} photographs; {place.contradiction_count} contradictions in a row"
+    left = f"{100 * place.surveyed_share:.0f} % of the survey left, by {place.photograph_count} photographs"
+    outdated = ", so it needs a new survey" if place.is_outdated else ""
+    return f"{left}{outdated}; {place.contradiction_count} contradictions in a row"
 
 
 def show_reference(client: Client, arguments: argparse.Namespace) -> int:

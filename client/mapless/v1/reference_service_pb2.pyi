@@ -154,7 +154,7 @@ class SceneCalibration(_message.Message):
     def __init__(self, position_factor_68: _Optional[float] = ..., position_factor_95: _Optional[float] = ..., rotation_factor_68: _Optional[float] = ..., rotation_factor_95: _Optional[float] = ..., query_count: _Optional[int] = ..., features: _Optional[str] = ..., backend: _Optional[str] = ..., variant: _Optional[_Union[_localization_service_pb2.Variant, str]] = ..., server_version: _Optional[str] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., reference_noise_m: _Optional[float] = ..., reference_noise_deg: _Optional[float] = ..., grows_with_gap: bool = ...) -> None: ...
 
 class Reference(_message.Message):
-    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance", "depth", "depth_sha256", "retire_time", "retirement", "place")
+    __slots__ = ("name", "image", "intrinsics", "world_from_camera", "create_time", "image_sha256", "feature_count", "mask", "mask_sha256", "provenance", "depth", "depth_sha256", "retire_time", "retirement", "place", "place_reference")
     NAME_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     INTRINSICS_FIELD_NUMBER: _ClassVar[int]
@@ -170,6 +170,7 @@ class Reference(_message.Message):
     RETIRE_TIME_FIELD_NUMBER: _ClassVar[int]
     RETIREMENT_FIELD_NUMBER: _ClassVar[int]
     PLACE_FIELD_NUMBER: _ClassVar[int]
+    PLACE_REFERENCE_FIELD_NUMBER: _ClassVar[int]
     name: str
     image: bytes
     intrinsics: _geometry_pb2.CameraIntrinsics
@@ -185,17 +186,20 @@ class Reference(_message.Message):
     retire_time: _timestamp_pb2.Timestamp
     retirement: str
     place: PlaceState
-    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., depth_sha256: _Optional[str] = ..., retire_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., retirement: _Optional[str] = ..., place: _Optional[_Union[PlaceState, _Mapping]] = ...) -> None: ...
+    place_reference: str
+    def __init__(self, name: _Optional[str] = ..., image: _Optional[bytes] = ..., intrinsics: _Optional[_Union[_geometry_pb2.CameraIntrinsics, _Mapping]] = ..., world_from_camera: _Optional[_Union[_geometry_pb2.RigidTransform, _Mapping]] = ..., create_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., image_sha256: _Optional[str] = ..., feature_count: _Optional[int] = ..., mask: _Optional[bytes] = ..., mask_sha256: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, _Mapping]] = ..., depth: _Optional[_Union[_geometry_pb2.DepthImage, _Mapping]] = ..., depth_sha256: _Optional[str] = ..., retire_time: _Optional[_Union[_timestamp_pb2.Timestamp, _Mapping]] = ..., retirement: _Optional[str] = ..., place: _Optional[_Union[PlaceState, _Mapping]] = ..., place_reference: _Optional[str] = ...) -> None: ...
 
 class PlaceState(_message.Message):
-    __slots__ = ("surveyed_share", "photograph_count", "contradiction_count")
+    __slots__ = ("surveyed_share", "photograph_count", "contradiction_count", "is_outdated")
     SURVEYED_SHARE_FIELD_NUMBER: _ClassVar[int]
     PHOTOGRAPH_COUNT_FIELD_NUMBER: _ClassVar[int]
     CONTRADICTION_COUNT_FIELD_NUMBER: _ClassVar[int]
+    IS_OUTDATED_FIELD_NUMBER: _ClassVar[int]
     surveyed_share: float
     photograph_count: int
     contradiction_count: int
-    def __init__(self, surveyed_share: _Optional[float] = ..., photograph_count: _Optional[int] = ..., contradiction_count: _Optional[int] = ...) -> None: ...
+    is_outdated: bool
+    def __init__(self, surveyed_share: _Optional[float] = ..., photograph_count: _Optional[int] = ..., contradiction_count: _Optional[int] = ..., is_outdated: bool = ...) -> None: ...
 
 class Provenance(_message.Message):
     __slots__ = ("source", "accuracy", "surveyed_share", "vouchers", "covariance", "adopt_time")
@@ -259,20 +263,24 @@ class GetSceneRequest(_message.Message):
     def __init__(self, name: _Optional[str] = ...) -> None: ...
 
 class GetSceneResponse(_message.Message):
-    __slots__ = ("scene", "warnings", "contradiction", "compared_pair_count", "agreeing_pair_count", "pending_work")
+    __slots__ = ("scene", "warnings", "contradiction", "compared_pair_count", "agreeing_pair_count", "pending_work", "adopted_reference_count", "retired_reference_count")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     WARNINGS_FIELD_NUMBER: _ClassVar[int]
     CONTRADICTION_FIELD_NUMBER: _ClassVar[int]
     COMPARED_PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
     AGREEING_PAIR_COUNT_FIELD_NUMBER: _ClassVar[int]
     PENDING_WORK_FIELD_NUMBER: _ClassVar[int]
+    ADOPTED_REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    RETIRED_REFERENCE_COUNT_FIELD_NUMBER: _ClassVar[int]
     scene: Scene
     warnings: _containers.RepeatedScalarFieldContainer[str]
     contradiction: str
     compared_pair_count: int
     agreeing_pair_count: int
     pending_work: _containers.RepeatedCompositeFieldContainer[PendingWork]
-    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., contradiction: _Optional[str] = ..., compared_pair_count: _Optional[int] = ..., agreeing_pair_count: _Optional[int] = ..., pending_work: _Optional[_Iterable[_Union[PendingWork, _Mapping]]] = ...) -> None: ...
+    adopted_reference_count: int
+    retired_reference_count: int
+    def __init__(self, scene: _Optional[_Union[Scene, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., contradiction: _Optional[str] = ..., compared_pair_count: _Optional[int] = ..., agreeing_pair_count: _Optional[int] = ..., pending_work: _Optional[_Iterable[_Union[PendingWork, _Mapping]]] = ..., adopted_reference_count: _Optional[int] = ..., retired_reference_count: _Optional[int] = ...) -> None: ...
 
 class PendingWork(_message.Message):
     __slots__ = ("kind", "name", "reference_count")

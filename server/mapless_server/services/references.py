@@ -96,6 +96,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
     async def GetScene(self, request: pb.GetSceneRequest, call: Call) -> pb.GetSceneResponse:
         """Implements ReferenceService.GetScene."""
+        from mapless_server.store import counts
+
         key = await self._reach.scene_key(call, request.name, "name")
         scene = await self._stored(self._store.get_scene, key)
         agreement = await self._agreement(key)
@@ -106,6 +108,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         if scene.attributes.adoption is not None:
             warnings[kept_adopted(self._adopted_hours)] = None
         warnings |= await self._stored(self._outdated_places, key)
+        numbers = await self._stored(counts.count_references, self._store.database, key)
         return pb.GetSceneResponse(
             scene=scene_to_message(scene),
             warnings=warnings,
@@ -115,6 +118,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
             pending_work=[
                 pb.PendingWork(kind=it.work, name=it.name, reference_count=it.reference_count) for it in pending
             ],
+            adopted_reference_count=numbers.adopted_count,
+            retired_reference_count=numbers.retired_count,
         )
 
     async def _agreement(self, key: SceneKey) -> Agreement:

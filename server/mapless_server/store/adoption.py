@@ -167,6 +167,26 @@ def unvouched(database: Database, scene_key: SceneKey) -> list[str]:
     return sorted(key for key, share in lost.items() if share > restoring.MOST_LOST_SHARE)
 
 
+def list_unplaced(database: Database, scene_key: SceneKey) -> list[str]:
+    """Keys of the adopted references whose place is not known: they were imported, or its surveyed one was deleted."""
+    key, column = reference.c.key, adopted_reference.c
+    place = reference.alias()
+    adopted = select(key).join(adopted_reference, column.reference_key == key)
+    statement = adopted.outerjoin(place, place.c.key == column.place_key).where(
+        reference.c.scene_id == scene_key, place.c.key.is_(None)
+    )
+    with database.read() as connection:
+        return list(connection.scalars(statement.order_by(key)))
+
+
+def set_places(database: Database, places: Mapping[str, str]) -> None:
+    """Stores the key of the surveyed reference whose place each adopted one is at, by key."""
+    with database.write() as connection:
+        for key, place_key in sorted(places.items()):
+            row = update(adopted_reference).where(adopted_reference.c.reference_key == key)
+            connection.execute(row.values(place_key=place_key))
+
+
 def set_usefulness(database: Database, usefulness: Mapping[str, float]) -> None:
     """Stores the usefulness of adopted references, by key; those that are gone are passed over."""
     with database.write() as connection:

@@ -23,6 +23,7 @@ from mapless_server.security import (
 from . import rows
 from .records import SceneRecord
 from .tables import (
+    adopted_reference,
     features,
     global_descriptor,
     reference,
@@ -146,9 +147,22 @@ def find_keys(connection: Connection, scene_key: SceneKey, reference_ids: Sequen
 
 
 def select_references() -> Select[Any]:
-    """Columns of `reference` and of `reference_standing`, null where nothing was said of a reference."""
-    said = [it for it in reference_standing.c if it.name != "reference_key"]
-    return select(reference, *said).outerjoin(reference_standing, reference_standing.c.reference_key == reference.c.key)
+    """Columns of `reference` and of `reference_standing`, null where nothing was said of a reference.
+
+    Those about a place are of an adopted reference's place; `place_id` is the id of the surveyed one that it is of.
+    """
+    key, own, adopted = reference.c.key, reference_standing.c, adopted_reference.c
+    place, of_place = reference.alias(), reference_standing.alias()
+    is_of_place = of_place.c.reference_key == func.coalesce(adopted.place_key, key)
+    retired = {"retire_time_us", "retire_reason"}
+    said = [it for it in of_place.c if it.name not in {"reference_key", *retired}]
+    return (
+        select(reference, own.retire_time_us, own.retire_reason, *said, place.c.reference_id.label("place_id"))
+        .outerjoin(reference_standing, own.reference_key == key)
+        .outerjoin(adopted_reference, adopted.reference_key == key)
+        .outerjoin(place, place.c.key == adopted.place_key)
+        .outerjoin(of_place, is_of_place)
+    )
 
 
 def find_key(connection: Connection, scene_key: SceneKey, reference_id: str, field: str = "name") -> str:

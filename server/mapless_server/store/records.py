@@ -165,8 +165,10 @@ class ReferenceRecord:
         provenance: how its pose is known.
         depth_sha256: `DepthImage.sha256` of its depth; empty without one.
         retired: since when, UTC, and why it is not chosen any more; None if it is. Of those that are listed or got one
-            by one, as the next.
-        standing: what photographs said of it; None if there were none.
+            by one, as the next two.
+        standing: what photographs said of it, or of the place of an adopted one; None if there were none.
+        place_id: of an adopted one, the id of the surveyed reference whose place it is at; empty if that one is not
+            known or was deleted. Of others empty.
     """
 
     scene_key: SceneKey
@@ -182,6 +184,7 @@ class ReferenceRecord:
     depth_sha256: str = ""
     retired: Retirement | None = None
     standing: Standing | None = None
+    place_id: str = ""
 
     @property
     def scene_id(self) -> str:

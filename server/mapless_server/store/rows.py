@@ -162,6 +162,7 @@ def reference_record(row: Row[Any]) -> ReferenceRecord:
         depth_sha256=row.depth_sha256 or "",
         retired=retirement(row),
         standing=None if getattr(row, "photograph_count", None) is None else standing(row),
+        place_id=getattr(row, "place_id", None) or "",
     )
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 from collections.abc import Awaitable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
@@ -15,6 +16,7 @@ from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
 from mapless_server.store import RetirementReason, Store, adoption, time_us
+from mapless_server.store.counts import find_references
 from mapless_server.store.records import Standing
 
 from .surveyed import Place, SurveyedLocalizer
@@ -55,17 +57,17 @@ class Keeper:
         self._localizer = localizer
         self._hours = hours
         self._checked: dict[SceneKey, int] = {}
-        """Generations of the scenes at which all that vouches for their adopted references was looked up."""
+        """Generations of the scenes at which their adopted references were looked up."""
 
     async def maintain(self, now: datetime, options: AdoptionOptions) -> None:
         """Deletes adopted references that are too old, and retires those whose vouching references are gone.
 
-        Places that were surveyed again are not outdated any more. What fails for a reference or a scene is logged and
-        counted, and ends nothing.
+        Those whose place is not known get one, and places that were surveyed again are not outdated any more. What
+        fails for a reference or a scene is logged and counted, and ends nothing.
         """
         before = now - timedelta(hours=self._hours)
         await self._guarded(self._delete_expired(before), "adopted references are not looked up by their age")
-        await self._guarded(self._retire_unvouched(), "adopted references are not looked up by scene")
+        await self._guarded(self._look_after(options), "adopted references are not looked up by scene")
         await self._guarded(self._end_all_outdated(options), "places that need a new survey are not looked up")
 
     def _guarded(self, work: Awaitable[object], fault: str) -> Awaitable[bool]:
@@ -77,19 +79,30 @@ class Keeper:
             if await self._guarded(deletion, f"{reference_id} of scene {scene_key}, which is too old, is not deleted"):
                 self._observer.count("adopted_expired")
 
-    async def _retire_unvouched(self) -> None:
+    async def _look_after(self, options: AdoptionOptions) -> None:
         scenes = await asyncio.to_thread(adoption.list_adopting_scenes, self._store.database)
         for scene_key, generation in scenes.items():
             if self._checked.get(scene_key) == generation:
                 continue
-            fault = f"what vouches for adopted references of scene {scene_key} is not looked up"
-            if await self._guarded(self._retire_unvouched_of(scene_key), fault):
+            fault = f"adopted references of scene {scene_key} are not looked up"
+            if await self._guarded(self._look_after_scene(scene_key, options), fault):
                 self._checked[scene_key] = generation
         self._checked = {it: generation for it, generation in self._checked.items() if it in scenes}
 
-    async def _retire_unvouched_of(self, scene_key: SceneKey) -> None:
+    async def _look_after_scene(self, scene_key: SceneKey, options: AdoptionOptions) -> None:
         gone = await asyncio.to_thread(adoption.unvouched, self._store.database, scene_key)
         await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
+        if unplaced := await asyncio.to_thread(adoption.list_unplaced, self._store.database, scene_key):
+            await asyncio.to_thread(self._find_places, scene_key, unplaced, options)
+
+    def _find_places(self, scene_key: SceneKey, keys: Sequence[str], options: AdoptionOptions) -> None:
+        """Gives adopted references whose place is not known that of the surveyed reference that is nearest now."""
+        database, places = self._store.database, dict[str, str]()
+        for key, record in find_references(database, scene_key, keys).items():
+            place = self._localizer.place(scene_key, record.world_from_camera, math.inf, options)
+            if place is not None:
+                places[key] = place.key
+        adoption.set_places(database, places)
 
     async def _end_all_outdated(self, options: AdoptionOptions) -> None:
         outdated_in = await asyncio.to_thread(adoption.list_outdated_scenes, self._store.database)

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from mapless import names, wire
 from mapless.depth import implausible_median
 from mapless.labels import check_labels
-from mapless.provenance import ADOPTED, GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
+from mapless.provenance import GIVEN, GIVEN_POSE, Provenance, provenance_from_message, provenance_to_message
 from mapless.scenes import (
     Calibration,
     adoption_from_message,
@@ -102,12 +102,14 @@ def reference_to_message(reference: ReferenceRecord) -> pb.Reference:
     if reference.retired is not None:
         message.retire_time.FromDatetime(reference.retired.time)
         message.retirement = retirement_of(reference.retired)
+    if reference.place_id:
+        message.place_reference = names.reference_name(reference.scene_id, reference.place_id)
     known = reference.standing
-    is_place = reference.provenance.source != ADOPTED  # adopted ones belong to the places of surveyed ones
-    if is_place and known is not None and (known.photograph_count or known.contradiction_count):
+    if known is not None and (known.photograph_count or known.contradiction_count):
         message.place.surveyed_share = 1.0 if known.surveyed_share is None else known.surveyed_share
         message.place.photograph_count = known.photograph_count
         message.place.contradiction_count = known.contradiction_count
+        message.place.is_outdated = known.outdate_time_us is not None
     message.create_time.FromDatetime(reference.create_time)
     return message
 
