@@ -277,12 +277,6 @@ def _numbers(database: object, key: SceneKey) -> counts.ReferenceNumbers:
     return counts.ReferenceNumbers(2, 1)
 
 
-def _is_adopted(service: reference_service.ReferenceService, key: SceneKey, reference_id: str) -> bool:
-    check_key(key)
-    check_id(reference_id)
-    return False
-
-
 _OF_DATABASES: tuple[tuple[Any, str, Any], ...] = (
     (adoption, "retire_by_operator", _retire),
     (counts, "count_references", _numbers),
@@ -290,7 +284,6 @@ _OF_DATABASES: tuple[tuple[Any, str, Any], ...] = (
     (restoring, "restore_reference", _restore_reference),
     (reference_service, "scene_report", _report),
     (reference_service.ReferenceService, "_outdated_places", _outdated),
-    (reference_service.ReferenceService, "_is_adopted", _is_adopted),
 )
 """Stand-ins for what reads or changes databases beside the store's methods."""
 

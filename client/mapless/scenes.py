@@ -99,6 +99,9 @@ MOST_PER_PLACE, LEAST_SURVEYED_SHARE = 100, 0.1
 LEAST_RADIUS_M, LARGEST_RADIUS_M = 1e-6, 10.0
 """Bounds of an adoption policy; of its radius where the unit of length is the metre."""
 
+DEFAULT_RADIUS_M = 0.03
+"""The radius of a policy that has none."""
+
 
 @dataclass(frozen=True)
 class AdoptionPolicy:
@@ -109,14 +112,15 @@ class AdoptionPolicy:
             any other that looks within 60 degrees of the same direction, 1 to 100; the least useful go first.
         min_trust: least trust of an answer, above 0, at most 1.
         max_radius_m: largest 68 % radius of an answer's position: 1e-6 to 10 metres, or above 0 in the scene's
-            arbitrary unit, for which the default is nothing to go by.
+            arbitrary unit, where the server refuses None (InvalidArgument). None is 0.03 m; a server's answer has the
+            number.
         min_surveyed_share: least share of a photograph's matches that surveyed references support, 0.1 to 1. Where
             photographs of a place have less, its adopted references are retired until there is a new survey.
     """
 
     most_per_place: int = 4
     min_trust: float = 0.5
-    max_radius_m: float = 0.03
+    max_radius_m: float | None = None
     min_surveyed_share: float = 0.3
 
     def __post_init__(self) -> None:
@@ -124,11 +128,16 @@ class AdoptionPolicy:
             raise ValueError(f"most_per_place must be 1 to {MOST_PER_PLACE}, is {self.most_per_place}")
         if not 0 < self.min_trust <= 1:  # in a message, 0 is the default
             raise ValueError(f"min_trust must be above 0, at most 1, is {self.min_trust:g}")
-        if not 0 < self.max_radius_m < math.inf:
+        if self.max_radius_m is not None and not 0 < self.max_radius_m < math.inf:
             raise ValueError(f"max_radius_m must be above 0 and finite, is {self.max_radius_m:g}")
         if not LEAST_SURVEYED_SHARE <= self.min_surveyed_share <= 1:
             share = self.min_surveyed_share
             raise ValueError(f"min_surveyed_share must be {LEAST_SURVEYED_SHARE:g} to 1, is {share:g}")
+
+    @property
+    def radius_m(self) -> float:
+        """`max_radius_m`, or its default where the unit is the metre."""
+        return DEFAULT_RADIUS_M if self.max_radius_m is None else self.max_radius_m
 
 
 def unit_vector(x: float, y: float, z: float) -> Vector:

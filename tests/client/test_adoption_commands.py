@@ -36,7 +36,7 @@ def run(server: RunningServer, capsys: pytest.CaptureFixture[str]) -> Run:
 
 def test_adoption_is_turned_on_changed_and_off(run: Run, client: Client, scene: str) -> None:
     code, text, _ = run("scene", "update", scene, "--adopt")
-    assert (code, client.get_scene(scene).adoption) == (0, AdoptionPolicy())
+    assert (code, client.get_scene(scene).adoption) == (0, AdoptionPolicy(max_radius_m=0.03))
     assert "at most 4 a place, trust 0.5, within 0.03 m (68 %), 30 % surveyed" in text
     assert run("scene", "update", scene, "--adopt", "--adopt-most", "2", "--adopt-radius", "0.1")[0] == 0
     assert client.get_scene(scene).adoption == AdoptionPolicy(most_per_place=2, max_radius_m=0.1)

@@ -45,8 +45,8 @@ def key_of(server: RunningServer, scene: str, reference_id: str) -> str:
 def test_a_policy_is_kept_and_forgotten(client: Client) -> None:
     policy = AdoptionPolicy(2, 0.7, 0.5, 0.4)
     assert client.create_scene("adopts", adoption=policy).adoption == policy
-    assert client.update_scene("adopts", adoption=AdoptionPolicy()).adoption == AdoptionPolicy()
-    assert client.get_scene("adopts").adoption == AdoptionPolicy()
+    assert client.update_scene("adopts", adoption=AdoptionPolicy()).adoption == AdoptionPolicy(max_radius_m=0.03)
+    assert client.get_scene("adopts").adoption == AdoptionPolicy(max_radius_m=0.03)
     assert client.update_scene("adopts", adoption=None).adoption is None
     client.delete_scene("adopts")
     assert client.create_scene("adopts").adoption is None
@@ -96,6 +96,19 @@ def test_an_arbitrary_unit_requires_the_radius(stubs: Stubs) -> None:
     update.update_mask.paths.append("adoption")
     assert failure_of(stubs.references.UpdateScene, update).field == "scene.adoption.max_radius_m"
     stubs.references.DeleteScene(pb.DeleteSceneRequest(name="scenes/units"))
+
+
+def test_a_policy_of_python_has_no_radius_in_other_units(client: Client) -> None:
+    with pytest.raises(InvalidArgument, match="is required: the scene's unit is arbitrary") as caught:
+        client.create_scene("units", arbitrary_unit=True, adoption=AdoptionPolicy())
+    assert caught.value.field == "adoption.max_radius_m"
+    client.create_scene("units", arbitrary_unit=True)
+    with pytest.raises(InvalidArgument, match="is required: the scene's unit is arbitrary") as caught:
+        client.update_scene("units", adoption=AdoptionPolicy())
+    assert caught.value.field == "scene.adoption.max_radius_m"
+    policy = AdoptionPolicy(max_radius_m=0.03)
+    assert client.update_scene("units", adoption=policy).adoption == policy
+    client.delete_scene("units")
 
 
 def test_the_unit_does_not_change_under_a_radius(client: Client, scene: str) -> None:

@@ -370,7 +370,7 @@ def test_the_policy_of_a_scene_is_kept(place: Place) -> None:
     with place.open() as store:
         hall(store)
         store.update_scene(HALL, down_in_world=(0.0, 0.0, -1.0))
-        assert store.get_attributes(HALL).adoption == AdoptionPolicy(most_per_place=2)
+        assert store.get_attributes(HALL).adoption == AdoptionPolicy(most_per_place=2, max_radius_m=0.03)
         assert store.update_scene(HALL, adoption=None).attributes.adoption is None
 
 

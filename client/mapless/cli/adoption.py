@@ -22,7 +22,7 @@ def add_policy(command: argparse.ArgumentParser) -> None:
     for flag, kind, unit, text in (
         ("most", int, "N", f"most adopted references at a place (default: {default.most_per_place})"),
         ("trust", float, "TRUST", f"least trust of an answer, above 0 (default: {default.min_trust:g})"),
-        ("radius", float, "M", f"largest 68 %% radius, m (default: {default.max_radius_m:g}) or the scene's unit"),
+        ("radius", float, "M", f"largest 68 %% radius, m (default: {default.radius_m:g}) or the scene's unit"),
         ("surveyed", float, "SHARE", f"least share of surveyed matches (default: {default.min_surveyed_share:g})"),
     ):
         group.add_argument(f"--adopt-{flag}", type=kind, metavar=unit, help=text)
@@ -59,7 +59,7 @@ def policy_text(policy: AdoptionPolicy | None, unit: str) -> str | None:
     share = f"{100 * policy.min_surveyed_share:.0f} % surveyed"
     return (
         f"at most {policy.most_per_place} a place, trust {policy.min_trust:g}, "
-        f"within {policy.max_radius_m:g} {unit} (68 %), {share}"
+        f"within {policy.radius_m:g} {unit} (68 %), {share}"
     )
 
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
@@ -40,7 +40,6 @@ from .messages.references import (
     named_place,
     outdated_places,
     reference_to_message,
-    require_radius,
     restored_from_message,
     restored_to_message,
     retired_to_message,
@@ -153,8 +152,6 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         changes, limit = changes_from_message(request), call.principal.limit
         if "labels" in changes and tenant_of(key) != NOWHERE:
             check_stays_in_reach(call, scene_id_of(key), changes["labels"], "scene.labels")
-        if changes.get("adoption") is not None and await self._stored(self._is_arbitrary_with, key, changes):
-            require_radius(request.scene.adoption, "scene.adoption")
         try:
             scene = await self._stored(partial(self._store.update_scene, key, **changes, limit=limit))
         except ContradictingDown as error:
@@ -171,11 +168,6 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         if changes.get("adoption") is not None:
             warnings.append(kept_adopted(self._adopted_hours))
         return pb.UpdateSceneResponse(scene=scene_to_message(scene), warnings=warnings)
-
-    def _is_arbitrary_with(self, key: SceneKey, changes: Mapping[str, object]) -> bool:
-        """Whether a scene's unit is arbitrary after changes."""
-        given = changes.get("arbitrary_unit")
-        return self._store.get_attributes(key).arbitrary_unit if given is None else bool(given)
 
     async def ListScenes(self, request: pb.ListScenesRequest, call: Call) -> pb.ListScenesResponse:
         """Implements ReferenceService.ListScenes."""
@@ -279,16 +271,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
 
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
         since, place_id = restored_from_message(request, scene_id_of(scene_key))
-        if place_id != "" and await self._stored(self._is_adopted, scene_key, place_id):
-            raise FieldError("place", f"{names.shown(place_id)} was adopted: name the surveyed reference of its place")
         restored = await self._stored(restoring.restore, self._store, scene_key, since, place_id)
         return restored_to_message(scene_id_of(scene_key), restored.reference_ids, restored.staying)
-
-    def _is_adopted(self, scene_key: SceneKey, reference_id: str) -> bool:
-        from mapless_server.store import adoption
-
-        keys = list(self._store.find_keys(scene_key, [reference_id]).values())
-        return adoption.places_of(self._store.database, keys) != keys
 
     async def RestoreReference(self, request: pb.RestoreReferenceRequest, call: Call) -> pb.RestoreReferenceResponse:
         """Implements ReferenceService.RestoreReference."""

@@ -87,7 +87,7 @@ class SceneAttributes:
     are only filled for answers. The adoption policy says which localized photographs become references; None for none.
     ContradictingDown if datum and down_in_world do not belong to the same world;
     DatumWithoutMetres if there is a datum, but the unit of length is arbitrary instead of the metre; WrongRadius if the
-    adoption policy's radius is out of bounds, in metres.
+    adoption policy's radius is out of bounds, in metres, or missing in an arbitrary unit. In metres it has a default.
     """
 
     datum: Datum | None = None
@@ -111,10 +111,13 @@ class SceneAttributes:
     def __post_init__(self) -> None:
         if self.datum is not None and self.arbitrary_unit:
             raise DatumWithoutMetres("needs a scene in metres: the unit of length of this one is arbitrary")
-        if self.adoption is not None and not self.arbitrary_unit:
-            radius_m = self.adoption.max_radius_m
-            if not LEAST_RADIUS_M <= radius_m <= LARGEST_RADIUS_M:
+        if self.adoption is not None:
+            radius_m = self.adoption.radius_m
+            if self.arbitrary_unit and self.adoption.max_radius_m is None:
+                raise WrongRadius("is required: the scene's unit is arbitrary, so it has no default")
+            if not self.arbitrary_unit and not LEAST_RADIUS_M <= radius_m <= LARGEST_RADIUS_M:
                 raise WrongRadius(f"must be {LEAST_RADIUS_M:g} to {LARGEST_RADIUS_M:g} metres, is {radius_m:g}")
+            object.__setattr__(self, "adoption", replace(self.adoption, max_radius_m=radius_m))
         if self.datum is None or self.down_in_world is None:
             return
         cosine = float(self.datum.down_in_world() @ self.down_in_world)

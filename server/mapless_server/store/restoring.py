@@ -14,7 +14,8 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, Select, delete, func, select, update
 
-from mapless_server.errors import DataLoss, FailedPrecondition
+from mapless.names import shown
+from mapless_server.errors import DataLoss, FailedPrecondition, InvalidArgument
 from mapless_server.security import SceneKey
 
 from . import changes, queries, retiring, rows
@@ -44,7 +45,7 @@ def restore(store: Store, scene_key: SceneKey, since: datetime | None = None, pl
 
     Those that were retired at a time or later, and of the place of the surveyed reference with this id: itself, and
     what was adopted there. That place needs no new survey any more; without time and place none of the scene does.
-    NotFound if there is no such scene or reference.
+    NotFound if there is no such scene or reference; InvalidArgument if that was adopted.
     """
     column, standing = reference.c, reference_standing.c
     retired = (
@@ -58,6 +59,10 @@ def restore(store: Store, scene_key: SceneKey, since: datetime | None = None, pl
         generation = changes.begin_change(connection, scene_key)
         if place_id:
             place_key = queries.find_key(connection, scene_key, place_id, "place")
+            adopted = adopted_reference.c
+            if connection.scalar(select(adopted.place_key).where(adopted.reference_key == place_key)) is not None:
+                fault = f"{shown(place_id)} was adopted: name the surveyed reference of its place"
+                raise InvalidArgument(fault, field="place")
             here = select(adopted_reference.c.reference_key).where(adopted_reference.c.place_key == place_key)
             retired = retired.where((column.key == place_key) | column.key.in_(here))
             is_current &= column.key == place_key

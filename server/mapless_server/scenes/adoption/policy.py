@@ -140,7 +140,7 @@ class Evidence:
 
 def is_certain(policy: AdoptionPolicy, found: Evidence) -> bool:
     """Whether an answer reaches the trust and the radius of a scene's policy."""
-    return found.trust >= policy.min_trust and found.position_68_m <= policy.max_radius_m
+    return found.trust >= policy.min_trust and found.position_68_m <= policy.radius_m
 
 
 def camera_error_m(camera: Camera, focal_share: float, distance_m: float) -> float:

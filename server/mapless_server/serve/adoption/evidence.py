@@ -76,7 +76,7 @@ def kept_query(query: Query, result: Result, policy: AdoptionPolicy, coverage: f
     if camera is None or camera.sigma is None:
         return None
     error_m = camera_error_m(camera.camera, camera.sigma.focal_share, distance_shown(result))
-    return read_with(kept, camera) if error_m <= policy.max_radius_m else None
+    return read_with(kept, camera) if error_m <= policy.radius_m else None
 
 
 def shares_compared(found: Evidence, result: Result) -> dict[str, float]:

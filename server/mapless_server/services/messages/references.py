@@ -203,12 +203,9 @@ def restored_to_message(
     scene_id: str, reference_ids: Sequence[str], staying: Mapping[str, str]
 ) -> pb.RestoreReferencesResponse:
     """Message of the ids of references that are chosen again, and why others stay retired, by id."""
-    return pb.RestoreReferencesResponse(
-        references=[names.reference_name(scene_id, it) for it in reference_ids],
-        still_retired=[
-            pb.StillRetired(name=names.reference_name(scene_id, it), reason=why) for it, why in staying.items()
-        ],
-    )
+    still = [pb.StillRetired(name=names.reference_name(scene_id, it), reason=why) for it, why in staying.items()]
+    made = [names.reference_name(scene_id, it) for it in reference_ids]
+    return pb.RestoreReferencesResponse(references=made, still_retired=still)
 
 
 MUCH_IGNORED = 0.8
@@ -287,8 +284,6 @@ def scene_to_message(scene: SceneRecord) -> pb.Scene:
 
 def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
     """Reads the attributes of a scene to be created; FieldError names a wrong field."""
-    if request.HasField("adoption") and request.arbitrary_unit:
-        require_radius(request.adoption, "adoption")
     try:
         return SceneAttributes(
             datum_from_message(request.datum, "datum") if request.HasField("datum") else None,
@@ -304,14 +299,6 @@ def attributes_from_message(request: pb.CreateSceneRequest) -> SceneAttributes:
         raise FieldError("datum", str(error)) from None
     except WrongRadius as error:
         raise FieldError("adoption.max_radius_m", str(error)) from None
-
-
-def require_radius(adoption: pb.AdoptionPolicy, field: str) -> None:
-    """Raises FieldError for a policy without a radius, in a scene whose unit is arbitrary."""
-    if not adoption.max_radius_m:
-        raise FieldError(
-            joined(field, "max_radius_m"), "is required: the scene's unit is arbitrary, so it has no default"
-        )
 
 
 def labels_from_message(labels: Mapping[str, str], field: str) -> dict[str, str]:
