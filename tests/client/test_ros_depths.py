@@ -164,7 +164,13 @@ class Client:
     def localize(self, *_: Any, depth: Any, **__: Any) -> Any:
         self.depths.append(depth)
         about = SimpleNamespace(
-            request_id="r", total_s=0.2, queue_s=0.0, references=(), depth_check=None, searched_scene_count=1
+            request_id="r",
+            total_s=0.2,
+            queue_s=0.0,
+            references=(),
+            depth_check=None,
+            searched_scene_count=1,
+            adoption="",
         )
         return Rejected("LOW_OVERLAP", "3 matches", about)  # type: ignore[arg-type]
 

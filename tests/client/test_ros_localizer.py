@@ -18,7 +18,7 @@ from mapless.ros import Localizer, LocalizerOptions, RosCamera, pose_of_body
 
 MAP_FROM_ODOM = RigidTransform(rotation_from_vector([0.0, 0.0, 1.2]), np.array([5.0, -3.0, 0.1]))
 COVARIANCE = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
-ABOUT: dict[str, Any] = {"depth_check": None, "searched_scene_count": 1}
+ABOUT: dict[str, Any] = {"depth_check": None, "searched_scene_count": 1, "adoption": ""}
 
 
 class PlantedClient:
@@ -36,8 +36,15 @@ class PlantedClient:
         if isinstance(self.plant, Exception):
             raise self.plant
         about = SimpleNamespace(
-            request_id="r", total_s=0.2, queue_s=0.0, references=(), depth_check=None, searched_scene_count=1
+            request_id="r",
+            total_s=0.2,
+            queue_s=0.0,
+            references=(),
+            depth_check=None,
+            searched_scene_count=1,
+            adoption="",
         )
+        about.adoption = "WAITING" if given["allow_adoption"] else ""
         if self.plant is not None:
             return Rejected(**({"diagnostics": about} | self.plant))
         time_s = capture_time.timestamp() - at(0) / 1e9
@@ -273,7 +280,13 @@ def test_a_rejected_image_is_localized_with_those_before(client: PlantedClient) 
         sent.append(frames)
         poses = tuple(MAP_FROM_ODOM.compose(it.session_from_camera) for it in frames)
         about = SimpleNamespace(
-            request_id="s", total_s=0.5, queue_s=0.0, references=(), depth_check=None, searched_scene_count=1
+            request_id="s",
+            total_s=0.5,
+            queue_s=0.0,
+            references=(),
+            depth_check=None,
+            searched_scene_count=1,
+            adoption="",
         )
         report = ImageReport(5, 9, "LOW_OVERLAP", about)  # type: ignore[arg-type]
         accuracy = Accuracy(0.01, 0.02, 0.1, 0.2, False)
@@ -338,3 +351,11 @@ def test_options_that_cannot_be_are_named(wrong: dict[str, Any], says: str) -> N
         LocalizerOptions("hall", **wrong)
     with pytest.raises(ValueError, match="scene is empty"):
         LocalizerOptions("")
+
+
+@pytest.mark.parametrize("allowed", [False, True])
+def test_images_may_be_kept_only_where_the_option_allows_it(client: PlantedClient, allowed: bool) -> None:
+    options = LocalizerOptions("hall", allow_adoption=allowed)
+    found = Localizer(cast(Any, client), options, lookup).localize(shot(1.0), RosCamera(CAMERA))
+    assert found.values.get("adoption", "") == ("WAITING" if allowed else "")
+    assert not LocalizerOptions("hall").allow_adoption

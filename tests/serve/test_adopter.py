@@ -257,6 +257,15 @@ def test_without_its_vouchers_an_adopted_reference_retires(held: Held) -> None:
     assert "were deleted or retired" in retired.retirement
 
 
+def test_a_photograph_of_a_deleted_scene_is_forgotten(held: Held) -> None:
+    held.client.create_scene("short", adoption=POLICY)
+    held.client.add_references("short", [it.reference() for it in held.place.references[::2]])
+    query = held.place.queries[0]
+    held.client.localize(query.data, query.camera, "short", allow_adoption=True)
+    held.client.delete_scene("short")
+    assert held.consider(held.taken()) is Refusal.CHANGED
+
+
 def test_a_place_without_its_surveyed_reference_is_another(held: Held) -> None:
     assert held.consider(held.candidate(held.place.queries[0])) is None
     (name,) = held.adopted

@@ -163,6 +163,7 @@ class Localizer:
                 mask=self._mask,
                 intrinsics_uncertainty=self._uncertainty,
                 depth=depth,
+                allow_adoption=self._options.allow_adoption,
                 timeout_s=timeout_s,
             )
             if self._options.sequence_length and odom_from_body is not None:
@@ -179,6 +180,7 @@ class Localizer:
                     intrinsics_uncertainty=self._uncertainty,
                 )
                 self._recent.append(replace(frame, depth=depth))
+                # Each image of a sequence was offered as a reference by its own call.
                 if isinstance(answer, Rejected) and len(self._recent) > 1:
                     together = self._client.localize_sequence(
                         list(self._recent), self._options.scene, coverage=coverage, timeout_s=timeout_s
@@ -296,6 +298,8 @@ def _values(answer: _Answer) -> dict[str, str]:
     values |= {"inliers": str(answer.inlier_count), "matches": str(answer.match_count)}
     if isinstance(answer, SequenceLocalization):
         values |= {"images": str(len(answer.images)), "jumps": str(len(answer.jumps))}
+    if about.adoption:
+        values["adoption"] = about.adoption
     if about.depth_check is not None:
         values["depth_check"] = str(about.depth_check)
     if answer.trust is not None:

@@ -34,6 +34,7 @@ class LocalizerOptions:
             while it moves; 0 for the server's defaults.
         scenes: up to 64 scenes, among which that of each image is found.
         group: labels by name that such scenes have; {} for all.
+        allow_adoption: whether images may be kept as references, where the scene adopts.
     """
 
     scene: str = ""
@@ -52,6 +53,7 @@ class LocalizerOptions:
     turn_deg_per_s: float = 0.0
     scenes: Sequence[str] = ()
     group: Mapping[str, str] | None = None
+    allow_adoption: bool = False
 
     def __post_init__(self) -> None:
         self._check_scenes()

@@ -122,6 +122,9 @@ def replay_bag_command(
     sequence_length: Annotated[
         int, typer.Option(help="Localize an image that is rejected alone with so many, 2 to 16, by the odometry.")
     ] = 0,
+    allow_adoption: Annotated[
+        bool, typer.Option("--allow-adoption", help="Images may be kept as references, if the scene adopts.")
+    ] = False,
     map_frame: Annotated[str, typer.Option(help="Name of the scene's world in what is written.")] = "map",
     odom_frame: Annotated[str, typer.Option(help="Frame of the odometry; default: that of the poses.")] = "",
     base_frame: Annotated[str, typer.Option(help="Frame whose pose is written; default: that of the poses.")] = "",
@@ -159,6 +162,7 @@ def replay_bag_command(
             use_last_pose=use_last_pose,
             coverage=coverage,
             timeout_s=60.0,
+            allow_adoption=allow_adoption,
         )
         settings = load_settings({"data_dir": data_dir}).settings
         given = read_camera(camera) if camera else None

@@ -20,7 +20,7 @@ from mapless.scenes import AdoptionPolicy
 from mapless.v1 import localization_service_pb2 as pb
 from mapless_server.engine.query import Photo, Query, Result
 from mapless_server.engine.queue_engine import QueueEngine
-from mapless_server.errors import AlreadyExists
+from mapless_server.errors import AlreadyExists, NotFound
 from mapless_server.method.judge.answer import Localization
 from mapless_server.scenes.adoption import policy as rules
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
@@ -136,8 +136,15 @@ class Adopter:
     async def consider(self, candidate: Candidate) -> Refusal | None:
         """Adopts a photograph, or says why not; also counts what it says of the references around.
 
-        RequestError if the scene is gone or the store is away.
+        RequestError if the store is away.
         """
+        try:
+            return await self._considered(candidate)
+        except NotFound as error:  # the scene was deleted meanwhile
+            log.info("a photograph is not considered: %s", error)
+            return self._counted(candidate.query.scene_key, rules.Refusal.CHANGED)
+
+    async def _considered(self, candidate: Candidate) -> Refusal | None:
         options, scene_key = self._options or rules.AdoptionOptions(), candidate.query.scene_key
         policy = (await asyncio.to_thread(self._store.get_attributes, scene_key)).adoption
         if policy is None:
