@@ -261,9 +261,9 @@ def _restore_reference(store: WatchfulStore, key: SceneKey, reference_id: str) -
 
 def _report(store: WatchfulStore, key: SceneKey, request: pb.GetSceneReportRequest) -> pb.SceneReport:
     check_key(key)
-    first, last, days = days_from_message(request, date(2026, 11, 30))
-    assert 0 <= last - first < MOST_DAYS
-    assert 1 <= days <= MOST_PERIOD_DAYS
+    days = days_from_message(request, date(2026, 11, 30))
+    assert 0 <= days.last - days.first < MOST_DAYS
+    assert 1 <= days.per_period <= MOST_PERIOD_DAYS
     return pb.SceneReport()
 
 

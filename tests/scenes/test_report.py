@@ -1,7 +1,6 @@
 """Reports of scenes: photographs become counts by place, and counts become suggestions; planted values."""
 
-import math
-from collections.abc import Iterable
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -9,11 +8,12 @@ import pytest
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.scenes.report.counting import Places, Sighting, counted
-from mapless_server.scenes.report.renewal import added_days, since_added
-from mapless_server.scenes.report.summary import Cluster, by_place, periods_of, suggestions, total
+from mapless_server.scenes.report.renewal import added_days
+from mapless_server.scenes.report.summary import Cluster, Period, PlaceCounts, Recent, recent_of, suggestions
 from mapless_server.scenes.retrieval.index import SceneIndex
 from mapless_server.store.counts import DAY_US, LOCALIZED, CountKey, Sums
 from mapless_server.store.records import Adopted, IndexedReference, SceneChanges
+from mapless_server.store.reporting import Answered, Days, OutcomeSums, PeriodSums
 from mapless_server.store.surveys import Surveyed
 
 DAY = 20_000
@@ -76,7 +76,8 @@ def test_the_surveyed_share_is_that_of_the_matches(places: Places) -> None:
     it = Sighting(5, LOCALIZED, pose.translation, None, pose.rotation[:, 2], "b", 80, 0.02, {"b": 60, "adopted": 20})
     other = Sighting(5, LOCALIZED, pose.translation, None, pose.rotation[:, 2], "b", 40, 0.08, {"b": 40})
     jointly = Sighting(5, LOCALIZED, reference_id="b", radius_m=0.04)
-    (found,) = periods_of(counted([it, other, jointly], places), 0, 0, 1)
+    ((key, sums),) = counted([it, other, jointly], places).items()
+    found = period({key.outcome: Answered(*(getattr(sums, name) for name in Answered._fields))})
     assert found.localized.photograph_count == 3
     assert found.means == pytest.approx((0.875, 0.04, 60.0))  # the geometric mean of the radii
 
@@ -126,36 +127,42 @@ def test_a_scene_without_surveyed_references_has_no_places() -> None:
     assert found == {CountKey(DAY, "", LOW): Sums(photograph_count=2)}
 
 
+def period(of_outcome: Mapping[str, Answered]) -> Period:
+    counts = PlaceCounts()
+    for outcome, answered in of_outcome.items():
+        counts.add(PeriodSums("p", 0, outcome, answered, 0.0))
+    return counts.period(0, Days(DAY, DAY, 1))
+
+
 def test_periods_end_with_the_last_day() -> None:
-    counts = {CountKey(DAY - age, "p", LOCALIZED): Sums(photograph_count=1 + age) for age in (0, 6, 7, 9)}
-    found = periods_of(counts, DAY - 9, DAY, 7)
+    found = [PlaceCounts().period(age, Days(DAY - 9, DAY, 7)) for age in (1, 0)]
     assert [(it.first_day - DAY, it.last_day - DAY) for it in found] == [(-9, -7), (-6, 0)]
-    assert [it.localized.photograph_count for it in found] == [18, 8]
 
 
 def test_the_commonest_rejection_comes_first() -> None:
-    counts = {CountKey(DAY, "p", it): Sums(photograph_count=n) for it, n in ((LOW, 2), (GATE, 5), (LOCALIZED, 9))}
-    (period,) = periods_of(counts, DAY, DAY, 7)
-    assert period.rejections == [(RejectionReason.GATE, 5), (RejectionReason.LOW_OVERLAP, 2)]
+    found = period({LOW: Answered(2), GATE: Answered(5), LOCALIZED: Answered(9)})
+    assert found.rejections == [(RejectionReason.GATE, 5), (RejectionReason.LOW_OVERLAP, 2)]
 
 
-def at_place(key: str, outcomes: Iterable[tuple[int, str, int]]) -> dict[CountKey, Sums]:
-    return {CountKey(DAY - age, key, outcome): Sums(photograph_count=n) for age, outcome, n in outcomes}
+def recent(*outcomes: tuple[float, str, int]) -> Recent:
+    """Photographs with so many half-lives of age, an outcome and a number each."""
+    found = [OutcomeSums("p", it, Sums(n), Sums(2.0**-age * n)) for age, it, n in outcomes]
+    return recent_of(found)["p"]
 
 
 def test_the_place_that_lacks_references_is_suggested_first() -> None:
     """A place that is nearly always localized needs none, none rescues bad photographs, and old ones count less."""
     planted = {
-        "corner": at_place("corner", [(0, LOW, 6), (1, GATE, 3), (0, LOCALIZED, 1)]),
-        "covered": at_place("covered", [(0, LOW, 12), (0, LOCALIZED, 400)]),
-        "dark": at_place("dark", [(0, DARK, 50)]),
-        "old": at_place("old", [(28, LOW, 20)]),
-        "unknown": at_place("unknown", [(0, LOW, 90)]),
+        "corner": recent((0, LOW, 6), (0.1, GATE, 3), (0, LOCALIZED, 1)),
+        "covered": recent((0, LOW, 12), (0, LOCALIZED, 400)),
+        "dark": recent((0, DARK, 50)),
+        "old": recent((2, LOW, 20)),
+        "unknown": recent((0, LOW, 90)),
     }
     poses = {name: at(i) for i, name in enumerate(planted) if name != "unknown"}
-    found = suggestions(planted, poses, DAY)
+    found = suggestions(planted, poses)
     assert [it.place_key for it in found] == ["corner", "old"]
-    rejected = 6 + 3 * 2 ** (-1 / 14)
+    rejected = 6 + 3 * 2**-0.1
     assert found[0].rescued_count == pytest.approx(rejected**2 / (rejected + 1))
     assert found[1].rescued_count == pytest.approx(5.0)
     assert (found[0].reason, found[0].rejected_count, found[0].photograph_count) == (RejectionReason.LOW_OVERLAP, 9, 10)
@@ -163,14 +170,14 @@ def test_the_place_that_lacks_references_is_suggested_first() -> None:
 
 def test_a_suggestion_is_where_photographs_were_taken() -> None:
     sums = Sums(4, position_count=3, offset_x=9.0, squared_offset=27.0, forward_x=3.0)
-    (found,) = suggestions({"p": {CountKey(DAY, "p", LOW): sums}}, {"p": at(10.0)}, DAY)
+    (found,) = suggestions(recent_of([OutcomeSums("p", LOW, sums, sums)]), {"p": at(10.0)})
     np.testing.assert_allclose(found.position, [13.0, 0.0, 0.0])
     np.testing.assert_allclose(found.forward, [1.0, 0.0, 0.0])
     assert [found.distance_m, found.positioned_share] == pytest.approx([3.0, 0.75])
 
 
 def test_without_positions_it_is_where_the_reference_is() -> None:
-    (found,) = suggestions({"p": at_place("p", [(0, LOW, 4)])}, {"p": at(10.0, 90.0)}, DAY)
+    (found,) = suggestions({"p": recent((0, LOW, 4))}, {"p": at(10.0, 90.0)})
     np.testing.assert_allclose(found.position, [10.0, 0.0, 0.0])
     np.testing.assert_allclose(found.forward, [1.0, 0.0, 0.0], atol=1e-12)
     assert found.distance_m == 0
@@ -182,20 +189,9 @@ def test_directions_that_cancel_are_unknown() -> None:
     assert cluster.forward is None
 
 
-def test_counts_of_deleted_references_have_no_place() -> None:
-    planted = at_place("gone", [(0, LOW, 2)]) | at_place("", [(0, LOW, 3)]) | at_place("p", [(0, LOW, 1)])
-    found = by_place(planted, ["p"])
-    assert list(found) == ["", "p"]
-    assert total(found[""].values()).photograph_count == 5
-    assert math.isclose(sum(it.photograph_count for it in planted.values()), 6)
-
-
-def test_rejections_before_a_reference_was_added_do_not_count() -> None:
+def test_a_reference_is_added_at_an_older_ones_place() -> None:
     """Two of one day renew no other; what is added later is at the older one that is nearest and looks as it does."""
     stored = {"a": (0, at(0.0)), "b": (0, at(10.0)), "c": (7, at(6.0)), "d": (8, at(9.0, 180.0)), "e": (9, at(6.5))}
     surveyed = [Surveyed(key, (DAY + day) * DAY_US, pose) for key, (day, pose) in stored.items()]
     assert added_days(surveyed, DAY) == {"b": DAY + 8, "c": DAY + 9}
     assert added_days(surveyed[:2], DAY) == added_days([], DAY) == {}
-    planted = {"b": {CountKey(DAY + day, "b", LOW): Sums(photograph_count=day) for day in (3, 8, 9)}}
-    (left,) = since_added(planted, added_days(surveyed, DAY))["b"]
-    assert left.day == DAY + 9

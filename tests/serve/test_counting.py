@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.plain_reports import stored_counts
 from support.servers import COVARIANCE, pose
 from support.stores import make_reference
 
@@ -26,7 +27,8 @@ from mapless_server.security import SceneKey
 from mapless_server.serve import counting
 from mapless_server.serve.counting import Counting, Noted
 from mapless_server.store import Store, counts
-from mapless_server.store.counts import DAY_US, LOCALIZED, read_report
+from mapless_server.store.counts import DAY_US, LOCALIZED
+from mapless_server.store.reporting import Days, read_report
 from mapless_server.store.rows import now_us
 
 HALL, YARD = SceneKey("hall"), SceneKey("yard")
@@ -170,10 +172,10 @@ def test_what_is_adopted_or_retired_is_counted_in_its_scene(tmp_path: Path) -> N
         it.count_in_scene(HALL, "retirements", 2, "contradicted")
         it.count_in_scene(YARD, "adoptions", 1, "adopted")  # it was deleted
         asyncio.run(it.write())
-        found = read_report(store.database, HALL, 0, now_us() // DAY_US, 9)
-    by_name = {what: count for (_, what), count in found.happened.items()}
+        with read_report(store.database, HALL, Days(0, now_us() // DAY_US, 1), 14) as found:
+            (by_name,), places = found.happened().values(), found.places()
     assert by_name == {"adoptions:adopted": 2, "adoptions:nothing_new": 1, "retirements:contradicted": 2}
-    assert found.counts == {}
+    assert places == []
     assert metrics.registry.get_sample_value("mapless_adoptions_total", {"result": "adopted"}) == 3
 
 
@@ -194,8 +196,7 @@ def counted_scenes(tmp_path: Path) -> Iterator[tuple[Store, Counting, Metrics]]:
 
 
 def photographs_in(store: Store, scene_key: SceneKey) -> int:
-    found = read_report(store.database, scene_key, 0, now_us() // DAY_US, 9).counts
-    return sum(it.photograph_count for it in found.values())
+    return sum(it.photograph_count for it in stored_counts(store, scene_key, 0, now_us() // DAY_US).values())
 
 
 def test_photographs_are_counted_once_when_the_server_stops(

@@ -1,10 +1,7 @@
 """Reports of scenes through a server, of photographs that it has answered."""
 
-import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from datetime import date, datetime, timedelta, timezone
-from typing import Any
 
 import grpc
 import numpy as np
@@ -20,7 +17,6 @@ from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.security import SceneKey
 from mapless_server.serve import counting
-from mapless_server.services import reports
 from mapless_server.store import adoption, counts
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums
 
@@ -90,23 +86,6 @@ def test_a_scene_made_again_has_no_counts(client: Client) -> None:
         client.localize(PHOTO, CAMERA, "again")
         assert reported(client, "again", 1).periods[-1].photograph_count == 1
         client.delete_scene("again")
-
-
-def test_a_server_makes_one_report_at_a_time(client: Client, scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So however many ask, memory is that of one."""
-    make, running, most = reports.scene_report, list[int](), list[int]()
-
-    def counted(*asked: Any) -> pb.SceneReport:
-        running.append(1)
-        most.append(len(running))
-        time.sleep(0.05)
-        running.pop()
-        return make(*asked)
-
-    monkeypatch.setattr("mapless_server.services.references.scene_report", counted)
-    with ThreadPoolExecutor(4) as pool:
-        list(pool.map(lambda _: client.get_scene_report(scene), range(4)))
-    assert most == [1] * 4
 
 
 def test_old_and_new_weeks_differ(client: Client, server: RunningServer, scene: str) -> None:

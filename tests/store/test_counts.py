@@ -7,12 +7,14 @@ from datetime import datetime, timezone
 
 import pytest
 from sqlalchemy import Connection, func, select
+from support.plain_reports import stored_counts, times
 from support.stores import Place, Shared, make_reference
 
 from mapless import Accuracy, AdoptionPolicy, Provenance, Voucher
 from mapless_server.security import SceneKey
 from mapless_server.store import RetirementReason, SceneAttributes, Store, adoption, counts, deletion
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums
+from mapless_server.store.reporting import Days, find_references, read_report
 from mapless_server.store.tables import scene_count
 
 HALL = SceneKey("hall")
@@ -23,7 +25,7 @@ ONE = Sums(photograph_count=1, position_count=1, offset_x=1.5, squared_offset=2.
 
 
 def stored(store: Store, first_day: int = 0, last_day: int = 2 * MONDAY) -> dict[CountKey, Sums]:
-    return dict(counts.read_report(store.database, HALL, first_day, last_day, 9).counts)
+    return stored_counts(store, HALL, first_day, last_day)
 
 
 def test_counts_of_one_key_add_up(place: Place) -> None:
@@ -31,9 +33,9 @@ def test_counts_of_one_key_add_up(place: Place) -> None:
     with place.open() as store:
         store.create_scene(HALL)
         counts.add_counts(store.database, {HALL: {KEY: ONE}})
-        counts.add_counts(store.database, {HALL: {KEY: ONE.times(2), other: Sums(1, 1, 0.5, 40, 1, -3.0)}})
+        counts.add_counts(store.database, {HALL: {KEY: times(ONE, 2), other: Sums(1, 1, 0.5, 40, 1, -3.0)}})
     with place.open() as store:
-        assert stored(store) == {KEY: ONE.times(3), other: Sums(1, 1, 0.5, 40, 1, -3.0)}
+        assert stored(store) == {KEY: times(ONE, 3), other: Sums(1, 1, 0.5, 40, 1, -3.0)}
 
 
 def test_counts_of_two_servers_add_up(shared: Shared) -> None:
@@ -41,7 +43,7 @@ def test_counts_of_two_servers_add_up(shared: Shared) -> None:
         first.create_scene(HALL)
         for store in (first, second):
             counts.add_counts(store.database, {HALL: {KEY: ONE}})
-        assert stored(first) == stored(second) == {KEY: ONE.times(2)}
+        assert stored(first) == stored(second) == {KEY: times(ONE, 2)}
 
 
 def test_a_deleted_scene_leaves_no_counts(place: Place) -> None:
@@ -93,13 +95,6 @@ def test_no_transaction_deletes_more_than_a_portion(place: Place, monkeypatch: p
         assert left[:3] == [3, 1, 0]
 
 
-def test_a_report_reads_its_days_alone(place: Place) -> None:
-    with place.open() as store:
-        store.create_scene(HALL)
-        counts.add_counts(store.database, {HALL: {KEY._replace(day=MONDAY + i): ONE for i in range(4)}})
-        assert sorted(it.day for it in stored(store, MONDAY + 1, MONDAY + 2)) == [MONDAY + 1, MONDAY + 2]
-
-
 def test_a_report_has_what_was_adopted_and_retired(place: Place) -> None:
     today = int(datetime.now(timezone.utc).timestamp()) // 86400
     with place.open() as store:
@@ -113,16 +108,18 @@ def test_a_report_has_what_was_adopted_and_retired(place: Place) -> None:
         ]
         adoption.retire(store, HALL, [new.key], RetirementReason.VOUCHERS_GONE)
         adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
-        found = counts.read_report(store.database, HALL, today, today + 1, 9)
-        assert [(it.reference_id, it.retirement_reason) for it in reversed(found.events)] == [
+        with read_report(store.database, HALL, Days(today, today + 1, 1), 14) as reader:
+            events, adopted = reader.events(9)
+            assert find_references(reader.connection, HALL, [keys["a"], "gone"]).keys() == {keys["a"]}
+        assert [(it.reference_id, it.retirement_reason) for it in reversed(events)] == [
             ("x", None),
             ("y", None),
             ("x", "vouchers_gone"),
             ("a", "contradicted"),
         ]
-        assert found.adopted == {at_b: (1, 1), keys["a"]: (0, 1)}
-        assert counts.read_report(store.database, HALL, today - 9, today - 1, 9).events == []
-        assert counts.find_references(store.database, HALL, [keys["a"], "gone"]).keys() == {keys["a"]}
+        assert adopted == {at_b: (1, 1), keys["a"]: (0, 1)}
+        with read_report(store.database, HALL, Days(today - 9, today - 1, 1), 14) as reader:
+            assert reader.events(9)[0] == []
 
 
 def test_adding_to_many_scenes_is_one_transaction(place: Place) -> None:
@@ -143,7 +140,7 @@ def test_the_scenes_with_most_photographs_are_named(place: Place) -> None:
         for it in (hall, yard, quiet):
             store.create_scene(it)
         planted = {
-            hall: {KEY: ONE.times(3), localized: Sums(photograph_count=2)},
+            hall: {KEY: times(ONE, 3), localized: Sums(photograph_count=2)},
             yard: {localized._replace(day=MONDAY + 1): Sums(photograph_count=9)},
             quiet: {localized: Sums(photograph_count=1), localized._replace(day=MONDAY - 1): Sums(photograph_count=50)},
         }

@@ -77,7 +77,6 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         self._reach = Reach(store)
         self._adding = Adding(engine, store, self._stored, adopted_hours)
         self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
-        self._reporting = asyncio.Lock()  # a report of a large scene takes seconds and much memory
 
     def close(self) -> None:
         """Waits for running operations of the store."""
@@ -139,10 +138,11 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     def _outdated_places(self, key: SceneKey) -> dict[str, None]:
         """Says which places of a scene need a new survey."""
         from mapless_server.store import adoption
-        from mapless_server.store.counts import find_references
+        from mapless_server.store.reporting import find_references
 
         outdated = adoption.list_outdated(self._store.database, key)
-        named = find_references(self._store.database, key, list(outdated)[:MOST_NAMED])
+        with self._store.database.read() as connection:
+            named = find_references(connection, key, list(outdated)[:MOST_NAMED])
         places = [named_place(name, named.get(it)) for it, name in outdated.items()]
         return dict.fromkeys([outdated_places(places)] if places else [])
 
@@ -328,8 +328,7 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def GetSceneReport(self, request: pb.GetSceneReportRequest, call: Call) -> pb.GetSceneReportResponse:
         """Implements ReferenceService.GetSceneReport."""
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
-        async with self._reporting:
-            return pb.GetSceneReportResponse(report=await self._stored(scene_report, self._store, scene_key, request))
+        return pb.GetSceneReportResponse(report=await self._stored(scene_report, self._store, scene_key, request))
 
     async def CheckCoverage(self, request: pb.CheckCoverageRequest, call: Call) -> pb.CheckCoverageResponse:
         """Implements ReferenceService.CheckCoverage."""

@@ -67,7 +67,7 @@ def name_outdated_place(store: Store, rejection: pb.Rejection, results: Iterable
     Reads the store.
     """
     from mapless_server.store import adoption  # for these rejections alone
-    from mapless_server.store.counts import find_references
+    from mapless_server.store.reporting import find_references
 
     for result in results:
         if result.scene_key is None or not result.references:
@@ -82,7 +82,8 @@ def name_outdated_place(store: Store, rejection: pb.Rejection, results: Iterable
         reference_id = outdated[place]
         rejection.outdated_place = names.reference_name(scene_id_of(result.scene_key), reference_id)
         if rejection.hint.advice in LACKS_REFERENCES:
-            records = find_references(store.database, result.scene_key, [place])
+            with store.database.read() as connection:
+                records = find_references(connection, result.scene_key, [place])
             rejection.hint.advice = pb.ADVICE_ADD_REFERENCES
             rejection.hint.message = (
                 f"Survey the place of reference {named_place(reference_id, records.get(place))} again: "

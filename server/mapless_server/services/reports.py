@@ -21,8 +21,9 @@ from .messages.enums import enum_to_message
 from .messages.references import reference_to_message, retirement_of
 
 if TYPE_CHECKING:  # services do not load what computes
-    from mapless_server.scenes.report.summary import Cluster, Period, Suggestion
-    from mapless_server.store.counts import Event
+    from mapless_server.scenes.report.summary import Period, Suggestion
+    from mapless_server.store.counts import Sums
+    from mapless_server.store.reporting import Days, Event
 
 MOST_PLACES, MOST_EVENTS = 1000, 1000
 DEFAULT_PERIOD_DAYS, DEFAULT_PERIODS = 7, 4
@@ -32,51 +33,55 @@ EPOCH = date(1970, 1, 1)
 
 def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRequest) -> pb.SceneReport:
     """The report that a request asks for; FieldError names a wrong day, NotFound if there is no such scene."""
+    from mapless_server.scenes.report import summary
     from mapless_server.scenes.report.renewal import added_days, since_added
-    from mapless_server.scenes.report.summary import Cluster, by_place, periods_of, suggestions
     from mapless_server.store.adoption import list_outdated
-    from mapless_server.store.counts import DAY_US, find_references, read_report
+    from mapless_server.store.counts import DAY_US
+    from mapless_server.store.reporting import find_references, read_report
     from mapless_server.store.surveys import list_surveyed
 
-    first, last, days = days_from_message(request, datetime.now(timezone.utc).date())
+    days = days_from_message(request, datetime.now(timezone.utc).date())
     scene, scene_id = store.get_scene(scene_key), scene_id_of(scene_key)
-    stored = read_report(store.database, scene_key, first, last, MOST_EVENTS)
     outdated = list_outdated(store.database, scene_key)
-    keys = {*(it.place_key for it in stored.counts), *(it.place_key for it in stored.events), *outdated}
-    records = find_references(store.database, scene_key, keys)
-    counted = by_place(stored.counts, records)
-    places = {key: counted.get(key, {}) for key in outdated} | counted
-    periods = periods_of(stored.counts, first, last, days)
-    message = pb.SceneReport(
-        scene=names.scene_name(scene_id),
-        first_day=period_to_message(periods[0]).first_day,
-        last_day=period_to_message(periods[-1]).last_day,
-        periods=[with_happened(period_to_message(it), it, stored.happened) for it in periods],
-        omitted_place_count=max(0, len(places) - MOST_PLACES),
-        arbitrary_unit=scene.attributes.arbitrary_unit,
-    )
-    for key, counts in list(places.items())[:MOST_PLACES]:
-        record = records.get(key)
-        its = place_to_message(
-            record,
-            periods_of(counts, first, last, days),
-            None if record is None else Cluster.of_rejected(counts, record.world_from_camera),
-            is_outdated=key in outdated,
-            adopted=stored.adopted.get(key, (0, 0)),
-        )
-        message.places.append(its)
-    poses = {key: record.world_from_camera for key, record in records.items()}
-    added = added_days(list_surveyed(store.database, scene_key, first * DAY_US), first)
-    for it in suggestions(since_added(places, added), poses, last):
+    added = added_days(list_surveyed(store.database, scene_key, days.first * DAY_US), days.first)
+    message = pb.SceneReport(scene=names.scene_name(scene_id), arbitrary_unit=scene.attributes.arbitrary_unit)
+    of_scene = summary.PlaceCounts()
+    with read_report(store.database, scene_key, days, summary.HALF_LIFE_DAYS) as stored:
+        (events, adopted), happened, counted = stored.events(MOST_EVENTS), stored.happened(), stored.places()
+        keys = {*counted, *outdated, *(it.place_key for it in events)}
+        records = find_references(stored.connection, scene_key, keys)
+        found = stored.rejected()
+        recent, rejected = summary.recent_of(found), summary.rejected_of(found, records)
+        places = list(dict.fromkeys([*outdated, *summary.in_order(counted, records, rejected)]))
+        of_place = {key: message.places.add() for key in places[:MOST_PLACES]}
+        for key, counts in summary.by_place(stored.periods(), records, of_scene):
+            if key in recent:  # until here it had those that were rejected
+                recent[key].photograph_count = counts.photograph_count
+                recent[key].weighted_count = counts.weighted_count
+            if key in of_place:
+                of_place[key].periods.extend(map(period_to_message, counts.periods(days)))
+        recent = since_added(recent, added, stored.since)
+    for key, its in of_place.items():
+        its.is_outdated = key in outdated
+        if (record := records.get(key)) is not None:
+            describe_place(its, record, rejected.get(key), adopted.get(key, (0, 0)))
+    for age in reversed(range(days.period_count)):
+        its_period = period_to_message(of_scene.period(age, days))
+        message.periods.append(with_happened(its_period, happened.get(age, {})))
+    message.first_day, message.last_day = message.periods[0].first_day, message.periods[-1].last_day
+    message.omitted_place_count = len(places) - len(of_place)
+    for it in summary.suggestions(recent, {key: record.world_from_camera for key, record in records.items()}):
         at, unit = records[it.place_key], scene.attributes.unit
         message.suggestions.append(suggestion_to_message(it, at, unit, it.place_key in outdated))
     ids = {key: record.reference_id for key, record in records.items()}
-    message.events.extend(event_to_message(it, scene_id, ids) for it in reversed(stored.events))
+    message.events.extend(event_to_message(it, scene_id, ids) for it in reversed(events))
     return message
 
 
-def days_from_message(request: pb.GetSceneReportRequest, today: date) -> tuple[int, int, int]:
-    """First and last day, since 1970, UTC, and the days of a period; FieldError names a wrong one."""
+def days_from_message(request: pb.GetSceneReportRequest, today: date) -> Days:
+    """The days of a report; FieldError names a wrong one."""
+    from mapless_server.store.reporting import Days
+
     if not 0 <= request.days_per_period <= MOST_PERIOD_DAYS:
         raise FieldError("days_per_period", f"must be 0 to {MOST_PERIOD_DAYS}, is {request.days_per_period}")
     period = request.days_per_period or DEFAULT_PERIOD_DAYS
@@ -90,7 +95,7 @@ def days_from_message(request: pb.GetSceneReportRequest, today: date) -> tuple[i
         raise FieldError(
             "first_day", f"must be less than {MOST_DAYS} days before last_day, is {last - first} days before"
         )
-    return first, last, period
+    return Days(first, last, period)
 
 
 def _day(text: str, field: str) -> int:
@@ -122,45 +127,42 @@ def period_to_message(period: Period) -> pb.PeriodCounts:
     )
 
 
-def with_happened(message: pb.PeriodCounts, period: Period, happened: Mapping[tuple[int, str], int]) -> pb.PeriodCounts:
-    """The message of a scene's period with what became of photographs and references."""
+def with_happened(message: pb.PeriodCounts, happened: Mapping[str, int]) -> pb.PeriodCounts:
+    """The message of a scene's period with what became of photographs and references, by `counts.happening`."""
     fields = {"adoptions": message.adoptions, "retirements": message.retirements}
-    for (day, what), count in happened.items():
+    for what, count in happened.items():
         name, _, result = what.partition(":")
-        if period.first_day <= day <= period.last_day and name in fields:
+        if name in fields:
             fields[name][result] += count
     return message
 
 
-def place_to_message(
-    record: ReferenceRecord | None,
-    periods: list[Period],
-    cluster: Cluster | None,
-    *,
-    is_outdated: bool,
-    adopted: tuple[int, int],
-) -> pb.PlaceReport:
-    """Message of how photographs of a place were answered; None for those whose place is not known.
+def describe_place(
+    message: pb.PlaceReport, record: ReferenceRecord, rejected: Sums | None, adopted: tuple[int, int]
+) -> None:
+    """Sets what is known of a place in its message, which has its periods.
 
-    `cluster` is where rejected ones were taken; `adopted` are the numbers of references in use and retired ones.
+    Args:
+        message: the message.
+        record: the place's reference.
+        rejected: sums over photographs that were rejected there; None without any.
+        adopted: numbers of adopted references there: in use, and retired.
     """
-    counted = [it for it in periods if it.of_outcome]
-    message = pb.PlaceReport(periods=map(period_to_message, counted), is_outdated=is_outdated)
-    if record is None:
-        return message
+    from mapless_server.scenes.report.summary import Cluster
+
     reference = reference_to_message(record)
     message.reference = reference.name
     message.world_from_camera.CopyFrom(reference.world_from_camera)
     message.adopted_count, message.retired_count = adopted
     if reference.HasField("place"):
         message.state.CopyFrom(reference.place)
+    cluster = None if rejected is None else Cluster.of(rejected, record.world_from_camera)
     if cluster is not None:
         message.rejected_position.photograph_count = round(cluster.count)
         message.rejected_position.position.CopyFrom(_vector(cluster.position))
         message.rejected_position.spread_m = cluster.spread_m
         if cluster.forward is not None:
             message.rejected_position.forward.CopyFrom(_vector(cluster.forward))
-    return message
 
 
 def _vector(vector: Array) -> geometry_pb2.Vector3:

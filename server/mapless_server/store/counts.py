@@ -1,4 +1,4 @@
-"""Counts of answered photographs by scene, day, place and outcome, for reports of scenes; and the rows of a report.
+"""Counts of answered photographs by scene, day, place and outcome, for reports of scenes, which `reporting` reads.
 
 Only sums are kept: no photographs, no callers. Servers that share a store add up. A row is deleted when its day is too
 old, and with its scene; its place is the key of a surveyed reference, which may have been deleted since.
@@ -6,20 +6,17 @@ old, and with its scene; its place is the key of a surveyed reference, which may
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 from sqlalchemy import Select, case, func, select, true
 
-from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey
 
-from . import queries, rows
+from . import queries
 from .database import Database
 from .deletion import delete_counts_where
-from .records import ReferenceRecord
 from .tables import adopted_reference, reference, reference_standing, scene, scene_count
 
 DAY_US = 24 * 3600 * 1_000_000
@@ -32,7 +29,8 @@ def happening(name: str, result: str) -> str:
     return f"{name}:{result}"
 
 
-_HAPPENED = ":"
+HAPPENED = ":"
+"""Stands in the outcomes of `happening`, and in no other."""
 
 
 class CountKey(NamedTuple):
@@ -78,10 +76,6 @@ class Sums:
     def __add__(self, other: Sums) -> Sums:
         return Sums(**{name: getattr(self, name) + getattr(other, name) for name in _NAMES})
 
-    def times(self, weight: float) -> Sums:
-        """The sums with each photograph counted as so many."""
-        return Sums(**{name: weight * getattr(self, name) for name in _NAMES})
-
 
 _NAMES = tuple(it.name for it in fields(Sums))
 
@@ -114,94 +108,6 @@ def delete_counts(database: Database, before_day: int) -> int:
     return delete_counts_where(database, scene_count.c.day < before_day)
 
 
-class Event(NamedTuple):
-    """A reference that was adopted or, with a reason, retired."""
-
-    reference_id: str
-    time_us: int
-    retirement_reason: str | None
-    place_key: str
-
-
-@dataclass(frozen=True, eq=False)
-class StoredReport:
-    """The counts that are stored of a scene's answers, read at one moment.
-
-    Attributes:
-        counts: answered photographs by what they are counted by, in no order.
-        happened: what else happened, by day and `happening`.
-        events: references that were adopted or retired, the last ones first.
-        adopted: for each place with adopted references, by key, how many are in use and how many are retired.
-    """
-
-    counts: Mapping[CountKey, Sums]
-    happened: Mapping[tuple[int, str], int]
-    events: Sequence[Event]
-    adopted: Mapping[str, tuple[int, int]]
-
-
-def read_report(
-    database: Database, scene_key: SceneKey, first_day: int, last_day: int, most_events: int
-) -> StoredReport:
-    """Reads what is stored of a scene's answers; of one that does not exist nothing.
-
-    Args:
-        database: the database.
-        scene_key: the scene.
-        first_day: since 1970, UTC.
-        last_day: likewise.
-        most_events: the last so many events are read.
-    """
-    column, adopted, standing = scene_count.c, adopted_reference.c, reference_standing.c
-    counted = select(scene_count).where(column.scene_id == scene_key, column.day.between(first_day, last_day))
-    of_scene: Select[Any] = (
-        select(
-            reference.c.reference_id,
-            reference.c.key,
-            adopted.adopt_time_us,
-            adopted.place_key,
-            standing.retire_time_us,
-            standing.retire_reason,
-        )
-        .outerjoin(adopted_reference, adopted.reference_key == reference.c.key)
-        .outerjoin(reference_standing, standing.reference_key == reference.c.key)
-        .where(reference.c.scene_id == scene_key)
-        .where(adopted.adopt_time_us.is_not(None) | standing.retire_time_us.is_not(None))
-    )
-    with database.read() as connection:
-        counts = {
-            CountKey(it.day, it.place_key, it.outcome): Sums(**{name: getattr(it, name) for name in _NAMES})
-            for it in connection.execute(counted)
-        }
-        found = connection.execute(of_scene).all()
-    events, places = list[Event](), dict[str, tuple[int, int]]()
-    for it in found:
-        place_key = it.key if it.place_key is None else it.place_key
-        if it.adopt_time_us is not None:
-            events.append(Event(it.reference_id, it.adopt_time_us, None, place_key))
-        if it.retire_time_us is not None:
-            events.append(Event(it.reference_id, it.retire_time_us, it.retire_reason, place_key))
-        used, retired = places.get(place_key, (0, 0))
-        is_retired = it.retire_time_us is not None
-        places[place_key] = (used + (not is_retired), retired + is_retired)
-    events = [it for it in events if first_day <= it.time_us // DAY_US <= last_day]
-    events.sort(key=lambda it: (-it.time_us, it.reference_id))
-    happened = {(it.day, it.outcome): sums.photograph_count for it, sums in counts.items() if _HAPPENED in it.outcome}
-    counts = {it: sums for it, sums in counts.items() if _HAPPENED not in it.outcome}
-    return StoredReport(counts, happened, events[:most_events], places)
-
-
-def find_references(database: Database, scene_key: SceneKey, keys: Collection[str]) -> dict[str, ReferenceRecord]:
-    """References of a scene by key, with what photographs said of them; those that are gone or damaged are left out."""
-    of_scene, found = queries.select_references().where(reference.c.scene_id == scene_key), dict[str, ReferenceRecord]()
-    with database.read() as connection:
-        for some in queries.portions(sorted(keys)):
-            for row in connection.execute(of_scene.where(reference.c.key.in_(some))):
-                with suppress(DataLoss):
-                    found[row.key] = rows.reference_record(row)
-    return found
-
-
 class BusyScene(NamedTuple):
     """A scene with numbers of its photographs of some last days, and of as many days before these."""
 
@@ -222,7 +128,7 @@ def busiest_scenes(database: Database, since_day: int, days: int, most: int) -> 
     ]
     found: Select[Any] = (
         select(column.scene_id, *numbers)
-        .where(column.day >= since_day - days, ~column.outcome.contains(_HAPPENED))
+        .where(column.day >= since_day - days, ~column.outcome.contains(HAPPENED))
         .group_by(column.scene_id)
         .having(numbers[0] > 0)
         .order_by(numbers[0].desc(), column.scene_id)

@@ -1,13 +1,16 @@
 """Leaves out of the counts of places what was counted before a reference was added there."""
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from mapless_server.store.counts import DAY_US, CountKey, Sums
+from mapless_server.store.counts import DAY_US
+from mapless_server.store.reporting import OutcomeSums
 from mapless_server.store.surveys import Surveyed
 
 from ..adoption.viewpoints import Viewpoints
+from .summary import Recent, recent_of
 
 MOST_ADDED = 1000
 """References that are looked at, the last ones that were added."""
@@ -37,10 +40,20 @@ def added_days(surveyed: Sequence[Surveyed], first_day: int) -> dict[str, int]:
 
 
 def since_added(
-    places: Mapping[str, Mapping[CountKey, Sums]], added: Mapping[str, int]
-) -> dict[str, dict[CountKey, Sums]]:
-    """The counts of places of the days after the last one on which a reference was added there."""
-    return {
-        place: {key: sums for key, sums in counts.items() if key.day > added.get(place, -1)}
-        for place, counts in places.items()
-    }
+    recent: Mapping[str, Recent],
+    added: Mapping[str, int],
+    since: Callable[[int, Collection[str]], Iterable[OutcomeSums]],
+) -> dict[str, Recent]:
+    """Photographs of places after the last day on which a reference was added there, if one was.
+
+    Args:
+        recent: all photographs, by the key of their place.
+        added: that day, by the key of the place.
+        since: reads the photographs of some places of the days after one.
+    """
+    found, places = {key: its for key, its in recent.items() if key not in added}, defaultdict[int, list[str]](list)
+    for key, day in added.items():
+        places[day].append(key)
+    for day, keys in places.items():
+        found |= recent_of(since(day, keys))
+    return found

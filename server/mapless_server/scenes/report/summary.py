@@ -1,4 +1,4 @@
-"""Summarizes the counts of a scene by period and place, and suggests where further references would help.
+"""Summarizes sums of a scene's counts by period and place, and suggests where further references would help.
 
 A reference rescues a photograph that was rejected for lack of evidence, unless the photograph itself is to blame: the
 larger the share of a place's photographs that are localized, the likelier that is. So at a place with R such rejections
@@ -7,14 +7,16 @@ among N photographs, each photograph counted as 2^(-age / 14 days), R * R / N ar
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import groupby
 
 import numpy as np
 
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.rejection import RejectionReason
-from mapless_server.store.counts import LOCALIZED, CountKey, Sums
+from mapless_server.store.counts import LOCALIZED, Sums
+from mapless_server.store.reporting import Answered, Days, OutcomeSums, PeriodSums
 
 HALF_LIFE_DAYS = 14
 """Age after which a photograph counts half for suggestions: two weekly reports. A convention."""
@@ -47,12 +49,12 @@ class Period:
 
     first_day: int
     last_day: int
-    of_outcome: Mapping[str, Sums]
+    of_outcome: Mapping[str, Answered]
 
     @property
-    def localized(self) -> Sums:
+    def localized(self) -> Answered:
         """Sums of the photographs that were localized."""
-        return self.of_outcome.get(LOCALIZED, Sums())
+        return self.of_outcome.get(LOCALIZED, Answered())
 
     @property
     def means(self) -> tuple[float, float, float]:
@@ -73,31 +75,72 @@ class Period:
 
 
 _REASONS = frozenset(it.value for it in RejectionReason)
+_LACKING = frozenset(it.value for it in LACKING_EVIDENCE)
 
 
-def periods_of(counts: Mapping[CountKey, Sums], first_day: int, last_day: int, days: int) -> list[Period]:
-    """Counts by periods of so many days, the last of which ends with the last day; the first may be shorter."""
-    found: dict[int, dict[str, Sums]] = defaultdict(lambda: defaultdict(Sums))
-    for key, sums in counts.items():
-        found[(last_day - key.day) // days][key.outcome] += sums
-    count = (last_day - first_day) // days + 1
-    ends = [(i, last_day - i * days) for i in reversed(range(count))]
-    return [Period(max(first_day, end - days + 1), end, found.get(i, {})) for i, end in ends]
+class PlaceCounts:
+    """Sums over photographs by period and outcome, of a place or of all of a scene.
+
+    Attributes:
+        photograph_count: all of them.
+        weighted_count: all of them, each counted by its age.
+    """
+
+    def __init__(self) -> None:
+        """Makes the object without photographs."""
+        self.photograph_count = 0
+        self.weighted_count = 0.0
+        self._of_age: dict[int, dict[str, Answered]] = {}
+
+    def add(self, it: PeriodSums) -> None:
+        """Adds sums."""
+        self.photograph_count += it.answered.photograph_count
+        self.weighted_count += it.weighted_count
+        of_outcome = self._of_age.setdefault(it.age, {})
+        before = of_outcome.get(it.outcome)
+        of_outcome[it.outcome] = it.answered if before is None else before.plus(it.answered)
+
+    def period(self, age: int, days: Days) -> Period:
+        """The period of an age, 0 the last one; the first one may be shorter than the others."""
+        last_day = days.last - age * days.per_period
+        return Period(max(days.first, last_day - days.per_period + 1), last_day, self._of_age.get(age, {}))
+
+    def periods(self, days: Days) -> list[Period]:
+        """The periods with photographs, in order."""
+        return [self.period(age, days) for age in sorted(self._of_age, reverse=True)]
 
 
-def by_place(counts: Mapping[CountKey, Sums], known: Iterable[str]) -> dict[str, dict[CountKey, Sums]]:
-    """Counts by the key of their place, that with most rejected photographs first; empty where it is not known."""
-    places, known = defaultdict[str, dict[CountKey, Sums]](dict), frozenset(known)
-    for key, sums in counts.items():
-        at = key if key.place_key in known else key._replace(place_key="")
-        its = places[at.place_key]
-        its[at] = its.get(at, Sums()) + sums
-    return dict(sorted(places.items(), key=lambda it: (-rejected_count(it[1]), it[0])))
+def by_place(
+    found: Iterable[PeriodSums], known: Container[str], of_scene: PlaceCounts
+) -> Iterator[tuple[str, PlaceCounts]]:
+    """Photographs by the key of their place, one after another; empty, and the last, where it is not a known one.
+
+    `found` is ordered by place; `of_scene` gets the photographs of all.
+    """
+    unknown = PlaceCounts()
+    for place_key, its in groupby(found, key=lambda it: it.place_key):
+        counts = PlaceCounts() if place_key in known else unknown
+        for it in its:
+            counts.add(it)
+            of_scene.add(it)
+        if counts is not unknown:
+            yield place_key, counts
+    yield "", unknown
 
 
-def rejected_count(counts: Mapping[CountKey, Sums]) -> int:
-    """Number of photographs that were rejected."""
-    return sum(sums.photograph_count for key, sums in counts.items() if key.outcome != LOCALIZED)
+def rejected_of(found: Iterable[OutcomeSums], known: Container[str]) -> dict[str, Sums]:
+    """Sums over rejected photographs by the key of their place; empty where it is not among the known ones."""
+    places = defaultdict[str, Sums](Sums)
+    for it in found:
+        places[it.place_key if it.place_key in known else ""] += it.sums
+    return dict(places)
+
+
+def in_order(place_keys: Iterable[str], known: Container[str], rejected: Mapping[str, Sums]) -> list[str]:
+    """Places, that with most rejected photographs first; empty for those that are not known."""
+    places = {it if it in known else "" for it in place_keys}
+    count = {it: rejected[it].photograph_count if it in rejected else 0 for it in places}
+    return sorted(places, key=lambda it: (-count[it], it))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +171,6 @@ class Cluster:
         known = forward / length if length > 1e-3 * sums.position_count else None
         return Cluster(sums.position_count, reference.translation + mean, known, spread)
 
-    @staticmethod
-    def of_rejected(counts: Mapping[CountKey, Sums], reference: RigidTransform) -> "Cluster | None":
-        """The cluster of all rejected photographs at the place of a reference."""
-        return Cluster.of(total(it for key, it in counts.items() if key.outcome != LOCALIZED), reference)
-
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
@@ -162,63 +200,66 @@ class Suggestion:
     forward_is_known: bool
 
 
-def suggestions(
-    places: Mapping[str, Mapping[CountKey, Sums]], poses: Mapping[str, RigidTransform], last_day: int
-) -> list[Suggestion]:
+@dataclass(eq=False)
+class Recent:
+    """Photographs of a place since a reference was added there.
+
+    Attributes:
+        photograph_count: all of them.
+        weighted_count: all of them, each counted by its age.
+        lacking: number of those that were rejected for lack of evidence, by reason.
+        weighted: sums over these, each counted by its age.
+    """
+
+    photograph_count: int = 0
+    weighted_count: float = 0.0
+    lacking: dict[RejectionReason, int] = field(default_factory=dict)
+    weighted: Sums = field(default_factory=Sums)
+
+    def add(self, it: OutcomeSums) -> None:
+        """Adds photographs."""
+        self.photograph_count += it.sums.photograph_count
+        self.weighted_count += it.weighted.photograph_count
+        if it.outcome in _LACKING:
+            self.lacking[RejectionReason(it.outcome)] = it.sums.photograph_count
+            self.weighted += it.weighted
+
+
+def recent_of(found: Iterable[OutcomeSums]) -> dict[str, Recent]:
+    """Photographs by the key of their place."""
+    places = defaultdict[str, Recent](Recent)
+    for it in found:
+        places[it.place_key].add(it)
+    return dict(places)
+
+
+def suggestions(places: Mapping[str, Recent], poses: Mapping[str, RigidTransform]) -> list[Suggestion]:
     """Places in the order of how many photographs a reference there would likely rescue, at most `MOST_SUGGESTIONS`.
 
     Args:
-        places: counts by the key of their place.
+        places: photographs by the key of their place.
         poses: pose of each place's reference; other places are left out.
-        last_day: the day at which a photograph counts as one.
     """
-    made = [_suggestion(key, its, poses[key], last_day) for key, its in places.items() if key in poses]
-    likely = [it for it in made if it is not None and it.rescued_count >= LEAST_RESCUED]
+    made = [_suggestion(key, its, poses[key]) for key, its in places.items() if its.lacking and key in poses]
+    likely = [it for it in made if it.rescued_count >= LEAST_RESCUED]
     return sorted(likely, key=lambda it: (-it.rescued_count, it.place_key))[:MOST_SUGGESTIONS]
 
 
-def _suggestion(
-    place_key: str, counts: Mapping[CountKey, Sums], pose: RigidTransform, last_day: int
-) -> Suggestion | None:
-    lacking = {key: sums for key, sums in counts.items() if key.outcome in _LACKING}
-    if not lacking:
-        return None
-    weighted, rejected = _weighted(counts, last_day), _weighted(lacking, last_day)
-    of_reason: dict[str, int] = defaultdict(int)
-    for key, sums in lacking.items():
-        of_reason[key.outcome] += sums.photograph_count
+def _suggestion(place_key: str, recent: Recent, pose: RigidTransform) -> Suggestion:
+    rejected, lacking = recent.weighted, recent.lacking
     cluster = Cluster.of(rejected, pose)
     known = None if cluster is None else cluster.forward
     forward = pose.rotation[:, 2] if known is None else known
     position = pose.translation if cluster is None else cluster.position
     return Suggestion(
         place_key,
-        rejected.photograph_count**2 / weighted.photograph_count,
-        rejected_count(lacking),
-        sum(it.photograph_count for it in counts.values()),
-        RejectionReason(max(of_reason, key=lambda it: (of_reason[it], it))),
+        rejected.photograph_count**2 / recent.weighted_count,
+        sum(lacking.values()),
+        recent.photograph_count,
+        max(lacking, key=lambda it: (lacking[it], it.value)),
         position,
         forward,
         float(np.linalg.norm(position - pose.translation)),
         rejected.position_count / rejected.photograph_count,
         known is not None,
     )
-
-
-_LACKING = frozenset(it.value for it in LACKING_EVIDENCE)
-
-
-def _weighted(counts: Mapping[CountKey, Sums], last_day: int) -> Sums:
-    """The sums of counts, each photograph counted by its age."""
-    found = Sums()
-    for key, sums in counts.items():
-        found += sums.times(2.0 ** (-max(0, last_day - key.day) / HALF_LIFE_DAYS))
-    return found
-
-
-def total(counts: Iterable[Sums]) -> Sums:
-    """The sum of all."""
-    found = Sums()
-    for it in counts:
-        found += it
-    return found
