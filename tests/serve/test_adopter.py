@@ -16,6 +16,8 @@ from support.servers import listening
 from mapless import AdoptionPolicy, Client, IntrinsicsUncertainty, NewReference, Rejected, RigImage, SequenceFrame
 from mapless.geometry import Camera
 from mapless.lenses import RadialTangential
+from mapless_server.engine.query import Photo
+from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.errors import DataLoss
 from mapless_server.method.bundle.priors import IntrinsicsSigma
 from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
@@ -26,6 +28,7 @@ from mapless_server.serve.adoption.adopter import Adopter
 from mapless_server.serve.adoption.waiting import Candidate
 from mapless_server.serve.opening import make_engine
 from mapless_server.settings import Settings
+from mapless_server.store import NewReference as Described
 from mapless_server.store import RetirementReason, Store, adoption
 from mapless_tools.demo.photographs import Photograph, Place
 from mapless_tools.demo.photographs import room as demo_room
@@ -42,6 +45,7 @@ class Held:
     client: Client
     store: Store
     place: Place
+    engine: QueueEngine
     adopter: Adopter
     loop: asyncio.AbstractEventLoop
 
@@ -80,14 +84,23 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Held]:
         patch.setattr(module.Adopter, "run", run)
         store = Store.open(data_dir)
         with listening(settings, store, make_engine) as (running, _), Client(running.address) as client:
-            yield Held(client, store, demo_room(), *started.result(60))
+            yield Held(client, store, demo_room(), running.engine, *started.result(60))
+
+
+@pytest.fixture(scope="module")
+def survey(server: Held) -> list[Described]:
+    """Every second reference of the room, with its features."""
+    photographs = server.place.references[::2]
+    describe = server.engine.references.describe
+    both = ((it, describe(Photo(it.data, it.camera, "image"), lambda: None)) for it in photographs)
+    return [Described(it.name, it.data, it.camera, it.world_from_camera, of.views, of.descriptors) for it, of in both]
 
 
 @pytest.fixture
-def held(server: Held) -> Iterator[Held]:
-    """The server with every second reference of the room."""
+def held(server: Held, survey: list[Described]) -> Iterator[Held]:
+    """The server with the survey."""
     server.client.create_scene("room", adoption=POLICY)
-    server.client.add_references("room", [it.reference() for it in server.place.references[::2]])
+    server.store.add_references(ROOM, survey)
     yield server
     server.client.delete_scene("room")
 

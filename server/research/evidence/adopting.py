@@ -29,8 +29,6 @@ SCENES = (KITCHEN, MEETING, LOCKERS, FOUNTAIN, "studio-flat")
 REFERENCES, QUERIES, CHOSEN = 30, 10, 10
 MOVED = (0.0, 0.015, 0.06)
 """By how much the right half is moved, shares of the width; not at all in true photographs."""
-NEAR_DEG, NEAR_SHARE = 30.0, 0.3
-"""Pairs of photographs and references that are no farther apart are counted."""
 BOUNDS = ((15, 2, 8), (30, 1, 8), (30, 2, 4), (30, 2, 8), (30, 2, 20), (30, 3, 8), (60, 2, 8), (120, 2, 8))
 """Least matches, least references, and least matches of each of these."""
 IN_USE = AdoptionOptions()
@@ -74,15 +72,21 @@ def _found(scenes: Path) -> tuple[Found, ...]:
     return tuple(it for name in SCENES for it in _found_in(scenes / name))
 
 
-def _found_in(folder: Path) -> Iterator[Found]:
+def asked_in(folder: Path, queries: int) -> list[tuple[int, Pair]]:
+    """Photographs of a place, so many, with the references that are chosen for them; and their frames' indices."""
     count = len(read_folder(folder).frames)
     indices = evenly_spread(range(count), min(count, REFERENCES + QUERIES))
     place = read_place(folder, indices)
     references = min(REFERENCES, 3 * len(indices) // 4)
     asked = list(right_pairs(place, references, [CHOSEN]))
-    asked = [asked[i] for i in evenly_spread(range(len(asked)), min(QUERIES, len(asked)))]
     index_of = {id(view): i for i, view in place.views.items()}
-    pairs = [it if not moved else _forged(folder, index_of[id(it.query)], it, moved) for it in asked for moved in MOVED]
+    chosen = [asked[i] for i in evenly_spread(range(len(asked)), min(queries, len(asked)))]
+    return [(index_of[id(it.query)], it) for it in chosen]
+
+
+def _found_in(folder: Path) -> Iterator[Found]:
+    asked = asked_in(folder, QUERIES)
+    pairs = [it if not moved else _forged(folder, i, it, moved) for i, it in asked for moved in MOVED]
     for i, measured in enumerate(answered(pairs)):
         answer, true = measured.answer, measured.pair.true_pose
         if isinstance(answer.outcome, Localization) and measured.off is not None and true is not None:

@@ -32,8 +32,8 @@ MOST_WITNESSES = 100
 class AdoptionOptions:
     """Bounds of adoption that are the same for all scenes.
 
-    Those about days, holders and means are policy, and so are what counts as new and as explained: how much is worth
-    keeping. `research.renovation` and `research.adoption_attack` measure what all of them together lead to.
+    `first_usefulness` and `places` are policy. `research.renovation` and `research.adoption_attack` measure what all of
+    them together lead to.
 
     Attributes:
         min_matches: least matches with surveyed references that agree with the pose from them.
@@ -56,7 +56,8 @@ class AdoptionOptions:
             most of them. Each holder counts once a day. A holder who may change the scene could delete the reference,
             and needs no other.
 
-    Evidence: adoption-matches, adoption-rivals, adoption-contradictions.
+    Evidence: adoption-matches, adoption-rivals, adoption-novelty, adoption-contradictions, adoption-witnesses,
+    adoption-outdated.
     """
 
     min_matches: int = 30

@@ -19,10 +19,11 @@ from mapless_server.store.counts import LOCALIZED, Sums
 from mapless_server.store.reporting import Answered, Days, OutcomeSums, PeriodSums
 
 HALF_LIFE_DAYS = 14
-"""Age after which a photograph counts half for suggestions: two weekly reports. A convention."""
+"""Age after which a photograph counts half for suggestions: two weekly reports. Evidence: suggestion-half-life."""
 MOST_SUGGESTIONS = 10
 LEAST_RESCUED = 2.0
-"""Places where fewer photographs would be rescued are not suggested: one photograph says little."""
+"""Places where fewer photographs would be rescued are not suggested: one photograph says little. Evidence:
+suggestion-least."""
 
 LACKING_EVIDENCE = frozenset(
     {

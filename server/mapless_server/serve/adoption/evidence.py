@@ -88,8 +88,11 @@ def shares_compared(found: Evidence, result: Result) -> dict[str, float]:
 def inliers_px(result: Result) -> Array:
     """The keypoints (M, 2) of the matches that agree with a pose, pixels of the photograph as it was sent."""
     support = result.answer.support
-    if not isinstance(support, PosedSupport):
-        return np.empty((0, 2))
+    return inliers_of(support) if isinstance(support, PosedSupport) else np.empty((0, 2))
+
+
+def inliers_of(support: PosedSupport) -> Array:
+    """The keypoints (M, 2) of the matches that agree with an estimate, see `inliers_px`."""
     keypoints = support.matches.keypoint[support.estimate.inliers]
     if support.two_view is not None:
         keypoints = np.concatenate([keypoints, support.two_view.keypoint[support.two_view.inliers]])
