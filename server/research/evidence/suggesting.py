@@ -16,7 +16,7 @@ import numpy as np
 from mapless.geometry import Array, RigidTransform
 from mapless_server.method.rejection import RejectionReason
 from mapless_server.scenes.report import summary
-from mapless_server.store.counts import LOCALIZED, CountKey, Sums
+from mapless_server.store.counts import Sums
 
 from .page import Measurement, Row
 
@@ -31,7 +31,6 @@ SHORT_DAYS, LONG_DAYS = 10.0, 60.0
 """Mean times of changes: half are short, half last until the place is surveyed, from when on it counts anew."""
 AT_FAULT = (0.5, 9.5)
 """Of a beta distribution: the share of a place's photographs that are rejected by their own fault."""
-REJECTED = RejectionReason.LOW_OVERLAP.value
 HALF_LIVES = (2, 4, 7, 14, 28, 56, 10_000)
 LEAST = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
@@ -72,17 +71,17 @@ def _building(seed: int) -> Building:
 
 def _suggested(building: Building, day: int) -> list[int]:
     """The places that a report of this day suggests."""
-    places: dict[str, dict[CountKey, Sums]] = {}
+    places = dict[str, summary.Recent]()
     for place in range(PLACES):
-        name, counts = str(place), dict[CountKey, Sums]()
-        for i in range(int(building.since[day, place]), day + 1):
-            rejected = int(building.rescued[i, place] + building.at_fault[i, place])
-            for outcome, count in ((REJECTED, rejected), (LOCALIZED, int(building.asked[i, place]) - rejected)):
-                if count:
-                    counts[CountKey(i, name, outcome)] = Sums(photograph_count=count)
-        places[name] = counts
+        days = np.arange(int(building.since[day, place]), day + 1)
+        weights = 2.0 ** ((days - day) / summary.HALF_LIFE_DAYS)
+        asked, rejected = (it[days, place] for it in (building.asked, building.rescued + building.at_fault))
+        if rejected.any():
+            weighted = Sums(photograph_count=float(weights @ rejected))  # type: ignore[arg-type]
+            lacking = {RejectionReason.LOW_OVERLAP: int(rejected.sum())}
+            places[str(place)] = summary.Recent(int(asked.sum()), float(weights @ asked), lacking, weighted)
     poses = dict.fromkeys(places, RigidTransform.identity())
-    return [int(it.place_key) for it in summary.suggestions(places, poses, day)]
+    return [int(it.place_key) for it in summary.suggestions(places, poses)]
 
 
 @dataclass(frozen=True)

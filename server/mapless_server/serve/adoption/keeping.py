@@ -16,8 +16,8 @@ from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence
 from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import SceneKey
 from mapless_server.store import RetirementReason, Store, adoption, time_us
-from mapless_server.store.counts import find_references
 from mapless_server.store.records import Standing
+from mapless_server.store.reporting import find_references
 
 from .surveyed import Place, SurveyedLocalizer
 from .waiting import Candidate
@@ -98,7 +98,9 @@ class Keeper:
     def _find_places(self, scene_key: SceneKey, keys: Sequence[str], options: AdoptionOptions) -> None:
         """Gives adopted references whose place is not known that of the surveyed reference that is nearest now."""
         database, places = self._store.database, dict[str, str]()
-        for key, record in find_references(database, scene_key, keys).items():
+        with database.read() as connection:
+            records = find_references(connection, scene_key, keys)
+        for key, record in records.items():
             place = self._localizer.place(scene_key, record.world_from_camera, math.inf, options)
             if place is not None:
                 places[key] = place.key
