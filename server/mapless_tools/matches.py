@@ -57,9 +57,9 @@ def read_picture(image: bytes, max_side_px: int) -> Picture:
     return _resized(pixels, max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
 
 
-def data_uri(picture: Picture, quality: int = 85) -> str:
+def data_uri(picture: Picture) -> str:
     """The picture as a JPEG in a data URI: nothing is left of the photograph's metadata."""
-    encoded = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    encoded = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
     return "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode()
 
 

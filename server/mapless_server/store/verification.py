@@ -65,13 +65,13 @@ def verify(connection: Connection, on_progress: Progress = ignore_progress) -> V
     if version is None:
         raise ValueError("it is empty")
     tables = [scene, reference, image, features, global_descriptor]
-    checks = [_check_references, _check_features, _check_descriptors, _check_counts, _check_attributes]
+    checks: list[_Check] = [_check_references, _check_features, _check_descriptors, _check_counts, _check_attributes]
     if version > OLDEST_VERSION:
         tables.append(mask)
-        checks.append(_check_masks)
+        checks.append(partial(_check_files, mask, rows.file))
     if version >= FIRST_WITH_DEPTH:
         tables.append(depth)
-        checks.append(_check_depths)
+        checks.append(partial(_check_files, depth, rows.depth_image))
     counts = {it.name: unless_damaged(connection, partial(_count, connection, it), lambda: 0) for it in tables}
     faults: list[str] = []
     for check in checks:
@@ -123,34 +123,23 @@ def _check_references(connection: Connection, counts: dict[str, int], on_progres
     yield from _orphans(connection, image)
 
 
-def _check_masks(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
-    column = reference.c
+def _check_files(
+    table: Table, read: Callable[..., object], connection: Connection, counts: dict[str, int], on_progress: Progress
+) -> Iterator[str]:
+    """Checks the masks or depths of references, by how a row is read."""
+    column, kind = reference.c, table.name
+    sha256 = column[f"{kind}_sha256"]
     statement: Select[Any] = (
-        select(column.key, column.scene_id, column.reference_id, column.mask_sha256.label("sha256"), mask.c.data)
-        .outerjoin(mask, mask.c.reference_key == column.key)
-        .where(column.mask_sha256.is_not(None) | mask.c.data.is_not(None))
+        select(column.key, column.scene_id, column.reference_id, sha256.label("sha256"), table.c.data)
+        .outerjoin(table, table.c.reference_key == column.key)
+        .where(sha256.is_not(None) | table.c.data.is_not(None))
     )
-    for name, row in _stream(connection, statement, "masks", counts[mask.name], on_progress):
+    for name, row in _stream(connection, statement, f"{kind}s", counts[kind], on_progress):
         if row is None:
-            yield f"{name}: mask, on damaged pages"
+            yield f"{name}: {kind}, on damaged pages"
             continue
-        yield from _fault(name, "mask", rows.file, row, "mask")
-    yield from _orphans(connection, mask)
-
-
-def _check_depths(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:
-    column = reference.c
-    statement: Select[Any] = (
-        select(column.key, column.scene_id, column.reference_id, column.depth_sha256.label("sha256"), depth.c.data)
-        .outerjoin(depth, depth.c.reference_key == column.key)
-        .where(column.depth_sha256.is_not(None) | depth.c.data.is_not(None))
-    )
-    for name, row in _stream(connection, statement, "depths", counts[depth.name], on_progress):
-        if row is None:
-            yield f"{name}: depth, on damaged pages"
-            continue
-        yield from _fault(name, "depth", rows.depth_image, row, "depth")
-    yield from _orphans(connection, depth)
+        yield from _fault(name, kind, read, row, kind)
+    yield from _orphans(connection, table)
 
 
 def _check_features(connection: Connection, counts: dict[str, int], on_progress: Progress) -> Iterator[str]:

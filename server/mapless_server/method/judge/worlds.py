@@ -96,21 +96,19 @@ class _Rival:
         return at_one_place(self.pose, replace(other.pose, world_from_camera=pose), options)
 
 
-def decide_among(worlds: Sequence[World], options: PlaceOptions = PLACES) -> Verdict:
+def decide_among(worlds: Sequence[World]) -> Verdict:
     """Returns the verdict of one of some worlds, or that two of them explain the photograph.
 
-    Args:
-        worlds: the worlds, those whose references match the photograph best coming first.
-        options: when poses are of one place.
+    Those whose references match the photograph best come first.
     """
     if not any(it.is_accepted for it in worlds):
         return max(worlds, key=_names_two).named()
-    best, *others = _rivals(worlds, options)
+    best, *others = _rivals(worlds, PLACES)
     if not others:
         return best.world.named()
     rivals = [best, *others]
     places, priors = [it.as_hypothesis() for it in rivals], [it.world.priors for it in rivals]
-    decided = place_of_priors(places, [it.score for it in rivals], priors, options)
+    decided = place_of_priors(places, [it.score for it in rivals], priors, PLACES)
     if isinstance(decided, int):
         return rivals[decided].world.named()
     first, second = places[:2]

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from mapless import Client, DataLoss, InvalidArgument, NotFound, Reference
-from mapless_server.method.features.extractors import FeatureExtractor, SiftExtractor
+from mapless_server.method.features.extractors import SiftExtractor
 from mapless_server.method.pairs.readings.alignment import Alignment, align
 from mapless_server.method.pairs.readings.errors import Pair, PairError, errors_of
 from mapless_tools.dataset import Frame
@@ -82,12 +82,7 @@ class SceneVerdict:
 
 
 def check_with_scene(
-    client: Client,
-    scene: str,
-    frames: Sequence[Frame],
-    existing: Sequence[Reference],
-    progress: Progress,
-    extractor: FeatureExtractor | None = None,
+    client: Client, scene: str, frames: Sequence[Frame], existing: Sequence[Reference], progress: Progress
 ) -> SceneVerdict:
     """Compares new frames with references of a scene; those that are there already are left out.
 
@@ -105,7 +100,7 @@ def check_with_scene(
             if (it := _frame(client, scene, there[name], Path(folder) / str(i))) is not None
         }
         position = {name: i for i, name in enumerate(stored)}
-        comparison = Comparison([*stored.values(), *new], extractor or SiftExtractor(), progress)
+        comparison = Comparison([*stored.values(), *new], SiftExtractor(), progress)
         pairs: list[Pair] = [
             (position[name], len(stored) + i) for i, names in enumerate(wanted) for name in names if name in position
         ]
