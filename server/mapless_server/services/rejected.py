@@ -72,14 +72,13 @@ def name_outdated_place(store: Store, rejection: pb.Rejection, results: Iterable
     for result in results:
         if result.scene_key is None or not result.references:
             continue
-        outdated = adoption.list_outdated(store.database, result.scene_key)
+        outdated = adoption.find_outdated(store.database, [it.key for it in result.references])
         counts = result.answer.reference_match_counts or (0,) * len(result.references)
         order = sorted(range(len(counts)), key=lambda i: -counts[i])
-        places = adoption.places_of(store.database, [result.references[i].key for i in order]) if outdated else []
-        place = next((it for it in places if it in outdated), None)
-        if place is None:
+        found = next((outdated[it] for i in order if (it := result.references[i].key) in outdated), None)
+        if found is None:
             continue
-        reference_id = outdated[place]
+        place, reference_id = found
         rejection.outdated_place = names.reference_name(scene_id_of(result.scene_key), reference_id)
         if rejection.hint.advice in LACKS_REFERENCES:
             with store.database.read() as connection:

@@ -14,7 +14,7 @@ from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, select, update
+from sqlalchemy import Connection, Row, Select, func, select, update
 
 from mapless.provenance import ADOPTED
 from mapless_server.security import SceneKey
@@ -243,15 +243,21 @@ def list_surveyed_since(database: Database, scene_key: SceneKey, time_us: int) -
         return {it.key: it.create_time_us for it in connection.execute(statement)}
 
 
-def places_of(database: Database, keys: Sequence[str]) -> list[str]:
-    """Key of the surveyed reference of whose place each reference is; of a surveyed one its own."""
-    column = adopted_reference.c
+def find_outdated(database: Database, keys: Collection[str]) -> dict[str, tuple[str, str]]:
+    """The places of references, by their keys, that need a new survey: key and id of the place's surveyed reference.
+
+    References at other places are left out.
+    """
+    adopted, standing, place = adopted_reference.c, reference_standing.c, reference.alias("place")
+    statement: Select[Any] = (
+        select(reference.c.key, place.c.key.label("place_key"), place.c.reference_id)
+        .outerjoin(adopted_reference, adopted.reference_key == reference.c.key)
+        .join(place, place.c.key == func.coalesce(adopted.place_key, reference.c.key))
+        .join(reference_standing, standing.reference_key == place.c.key)
+        .where(reference.c.key.in_(sorted(keys)), standing.outdate_time_us.is_not(None))
+    )
     with database.read() as connection:
-        rows_found = connection.execute(
-            select(column.reference_key, column.place_key).where(column.reference_key.in_(sorted(keys)))
-        )
-        place_of = {it.reference_key: it.place_key for it in rows_found}
-    return [place_of.get(key, key) for key in keys]
+        return {it.key: (it.place_key, it.reference_id) for it in connection.execute(statement)}
 
 
 def change_standings(
