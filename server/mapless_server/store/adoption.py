@@ -14,7 +14,7 @@ from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, func, select, update
+from sqlalchemy import Connection, Row, Select, bindparam, func, select, update
 
 from mapless.provenance import ADOPTED
 from mapless_server.security import SceneKey
@@ -243,21 +243,24 @@ def list_surveyed_since(database: Database, scene_key: SceneKey, time_us: int) -
         return {it.key: it.create_time_us for it in connection.execute(statement)}
 
 
+_PLACE = reference.alias("place")
+_FIND_OUTDATED: Select[Any] = (  # made once: a rejection waits for it
+    select(reference.c.key, _PLACE.c.key.label("place_key"), _PLACE.c.reference_id)
+    .outerjoin(adopted_reference, adopted_reference.c.reference_key == reference.c.key)
+    .join(_PLACE, _PLACE.c.key == func.coalesce(adopted_reference.c.place_key, reference.c.key))
+    .join(reference_standing, reference_standing.c.reference_key == _PLACE.c.key)
+    .where(reference.c.key.in_(bindparam("keys", expanding=True)), reference_standing.c.outdate_time_us.is_not(None))
+)
+
+
 def find_outdated(database: Database, keys: Collection[str]) -> dict[str, tuple[str, str]]:
     """The places of references, by their keys, that need a new survey: key and id of the place's surveyed reference.
 
     References at other places are left out.
     """
-    adopted, standing, place = adopted_reference.c, reference_standing.c, reference.alias("place")
-    statement: Select[Any] = (
-        select(reference.c.key, place.c.key.label("place_key"), place.c.reference_id)
-        .outerjoin(adopted_reference, adopted.reference_key == reference.c.key)
-        .join(place, place.c.key == func.coalesce(adopted.place_key, reference.c.key))
-        .join(reference_standing, standing.reference_key == place.c.key)
-        .where(reference.c.key.in_(sorted(keys)), standing.outdate_time_us.is_not(None))
-    )
     with database.read() as connection:
-        return {it.key: (it.place_key, it.reference_id) for it in connection.execute(statement)}
+        found = connection.execute(_FIND_OUTDATED, {"keys": sorted(keys)})
+        return {it.key: (it.place_key, it.reference_id) for it in found}
 
 
 def change_standings(
