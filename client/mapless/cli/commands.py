@@ -253,7 +253,8 @@ def _place_of(it: Reference) -> str | None:
 
 
 def _state_of(place: PlaceState) -> str:
-    left = f"{100 * place.surveyed_share:.0f} % of the survey left, by {place.photograph_count} photographs"
+    count = place.photograph_count
+    left = f"{100 * place.surveyed_share:.0f} % of the survey left, by {count} photograph{'' if count == 1 else 's'}"
     outdated = ", so it needs a new survey" if place.is_outdated else ""
     return f"{left}{outdated}; {place.contradiction_count} contradictions in a row"
 
