@@ -557,6 +557,6 @@ def test_an_answer_says_why_nothing_is_kept(held: Held, monkeypatch: pytest.Monk
     client.update_scene("room", adoption=None)
     assert said() == "SCENE_ADOPTS_NOTHING"
     client.update_scene("room", adoption=POLICY)
-    monkeypatch.setattr(waiting, "MAX_WAITING", 0)
+    monkeypatch.setattr(waiting, "MAX_WAITING_BYTES", 0)
     assert said() == "QUEUE_FULL"
     assert held.adopter.take() is None

@@ -76,6 +76,14 @@ def test_large_photographs_make_room_for_another_tenant() -> None:
     assert tenants(waiting) == ["one", "one", "two"]
 
 
+def test_large_photographs_take_no_others_room() -> None:
+    """Each tenant has half of the bytes, however few photographs those are."""
+    waiting, part = Waiting(), MAX_WAITING_BYTES // 20
+    assert [waiting.add(candidate("two", part)) for _ in range(10)] == [0] * 10
+    assert [waiting.add(candidate(size_bytes=5 * part)) for _ in range(4)] == [0, 0, 1, 1]
+    assert tenants(waiting) == ["two"] * 10 + ["one"] * 2
+
+
 def test_what_has_waited_too_long_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     waiting = Waiting()
     for offered_s in (0.0, 10.0):

@@ -23,8 +23,9 @@ import numpy as np
 
 from mapless.geometry import RigidTransform
 from mapless_server.scenes.adoption.policy import Evidence
-from mapless_server.security import Principal
+from mapless_server.security import Principal, SceneKey
 from mapless_server.serve.adoption.adopter import adopted_id
+from mapless_server.store import adoption
 from mapless_tools.evaluate.metrics import pose_error
 from mapless_tools.ingest.formats.cameras import read_folder
 from mapless_tools.output_files import markdown_table
@@ -151,7 +152,7 @@ async def measure(
             shifts, lost, gained, off_m = compared(before, await answers(server, views))
             adopted = [it async for it in server.client.list_references(SCENE, only_adopted=True)]
             retired = [it async for it in server.client.list_references(SCENE, only_retired=True)]
-            outdated = len((await server.client.get_scene(SCENE)).warnings)
+            outdated = len(adoption.list_outdated(server.store.database, SceneKey(SCENE)))
             true = {adopted_id(it.path.read_bytes()): it.world_from_camera for it in photographs}
             off = tuple(
                 pose_error(true[it.reference_id], it.world_from_camera)[0] for it in adopted if it.reference_id in true

@@ -13,7 +13,7 @@ from mapless_server.scenes.adoption.policy import Evidence
 from mapless_server.security import tenant_of
 
 MAX_WAITING, MAX_WAITING_BYTES = 32, 64 * 2**20
-"""Photographs that wait to be considered, and their bytes together."""
+"""Photographs that wait to be considered, and their bytes together, of which each takes its part or its own size."""
 MOST_WAITING_S = 3600.0
 """After this time a photograph that was never considered, since the server was not idle, is dropped."""
 
@@ -44,9 +44,9 @@ class Candidate:
         return tenant_of(self.query.scene_key)
 
     @property
-    def size_bytes(self) -> int:
-        """Size of its files."""
-        return self.query.photo.size_bytes
+    def room_bytes(self) -> int:
+        """How much of the queue it takes: the size of its files, or a small one's part of the queue."""
+        return max(self.query.photo.size_bytes, MAX_WAITING_BYTES // MAX_WAITING)
 
 
 class Waiting:
@@ -69,7 +69,7 @@ class Waiting:
         Where the queue is full, others leave it as `_leaving` says. None does for a candidate that has no room then.
         """
         stay = list(self._candidates)
-        while len(stay) >= MAX_WAITING or sum(map(_size_of, stay)) + candidate.size_bytes > MAX_WAITING_BYTES:
+        while sum(it.room_bytes for it in stay) + candidate.room_bytes > MAX_WAITING_BYTES:
             if (leaving := _leaving(stay, candidate)) is None:
                 return 1
             stay.remove(leaving)
@@ -97,22 +97,21 @@ class Waiting:
                 await asyncio.wait_for(self._arrived.wait(), limit_s)
 
 
-def _size_of(candidate: Candidate) -> int:
-    return candidate.size_bytes
-
-
 def _leaving(waiting: Sequence[Candidate], candidate: Candidate) -> Candidate | None:
-    """The one that makes room for a candidate: the newest of the holder with most, of the tenant with most.
+    """The one that makes room for a candidate: the newest of the holder with most room, of the tenant with most.
 
     Where no tenant has more than the candidate's would have, it is one of that; None if no holder of it has more than
     the candidate's would have, either.
     """
-    of_tenant = Counter(it.tenant for it in waiting)
+    of_tenant, of_holder = Counter[str](), Counter[str]()
+    for it in waiting:
+        of_tenant[it.tenant] += it.room_bytes
     tenant = max(of_tenant, key=lambda it: of_tenant[it], default=candidate.tenant)
-    is_own = of_tenant[tenant] <= of_tenant[candidate.tenant] + 1
+    is_own = of_tenant[tenant] <= of_tenant[candidate.tenant] + candidate.room_bytes
     its = [it for it in waiting if it.tenant == (candidate.tenant if is_own else tenant)]
-    of_holder = Counter(it.holder for it in its)
+    for it in its:
+        of_holder[it.holder] += it.room_bytes
     holder = max(of_holder, key=lambda it: of_holder[it], default=candidate.holder)
-    if is_own and of_holder[holder] <= of_holder[candidate.holder] + 1:
+    if is_own and of_holder[holder] <= of_holder[candidate.holder] + candidate.room_bytes:
         return None
     return next(it for it in reversed(its) if it.holder == holder)
