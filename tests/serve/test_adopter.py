@@ -500,12 +500,23 @@ def _asked(held: Held, data: bytes, camera: Camera, said: IntrinsicsUncertainty)
     return held.taken()
 
 
+def _with_focal(camera: Camera, factor: float) -> Camera:
+    return replace(camera, focal_x_px=factor * camera.focal_x_px, focal_y_px=factor * camera.focal_y_px)
+
+
+def test_a_focal_length_that_matches_doubt_is_not_kept(held: Held) -> None:
+    """It is 1 % wrong: the answer is as certain as the policy asks for, and the reference would move others."""
+    query = held.place.queries[1]
+    candidate = _asked(held, query.data, _with_focal(query.camera, 1.01), IntrinsicsUncertainty())
+    assert held.consider(candidate) is Refusal.UNSUPPORTED
+
+
 def test_a_caller_cannot_make_a_kept_pose_more_certain(held: Held) -> None:
     """The focal length is 0.5 % wrong, and said to be right to 0.01 %."""
-    query, wrong = held.place.queries[0], 1.005
-    focal_px, other_px = (wrong * it for it in (query.camera.focal_x_px, query.camera.focal_y_px))
-    camera = replace(query.camera, focal_x_px=focal_px, focal_y_px=other_px)
-    candidate = _asked(held, query.data, camera, IntrinsicsUncertainty(focal_sigma_px=1e-4 * focal_px))
+    query = held.place.queries[0]
+    camera = _with_focal(query.camera, 1.005)
+    said = IntrinsicsUncertainty(focal_sigma_px=1e-4 * camera.focal_x_px)
+    candidate = _asked(held, query.data, camera, said)
     assert held.consider(candidate) is None
     (kept,) = held.client.list_references("room", only_adopted=True)
     error_m, _ = pose_error(query.world_from_camera, kept.world_from_camera)

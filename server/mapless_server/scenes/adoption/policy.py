@@ -92,7 +92,7 @@ class Refusal(str, Enum):
     UNCERTAIN = "uncertain"
     """Its trust or radius does not reach the scene's policy, or the answer is not refined."""
     UNSUPPORTED = "unsupported"
-    """Surveyed references alone do not localize it with that certainty, by enough matches."""
+    """Surveyed references alone do not localize it with that certainty, by enough matches, or with another camera."""
     LITTLE_SURVEYED = "little_surveyed"
     """They support too small a share of its matches."""
     DISAGREES = "disagrees"

@@ -28,7 +28,7 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal, SceneKey
 from mapless_server.store import NewReference, Store, adoption, time_us
 
-from .evidence import distance_shown, evidence_as_kept, inliers_px, kept_query, keypoints_px, rival_count
+from .evidence import distance_shown, has_its_camera, inliers_px, kept_query, keypoints_px, rival_count
 from .keeping import Keeper, guarded
 from .surveyed import Place, SurveyedLocalizer
 from .waiting import Candidate, Waiting
@@ -154,11 +154,13 @@ class Adopter:
         if place is None:
             return self._counted(scene_key, rules.Refusal.CHANGED)
         result = await self._localizer.localized(candidate.query, place.surveyed_ids, candidate.query.photo.mask)
-        surveyed = evidence_as_kept(candidate.query, result)
+        surveyed = self._localizer.evidence(candidate.query, result)
         is_outdated = await self._keeper.learn(candidate, place, surveyed, policy, self._now(), options)
         refused = rules.refusal(policy, candidate.answered, surveyed, options)
         if refused is None and is_outdated:
             refused = rules.Refusal.LITTLE_SURVEYED
+        if refused is None and not has_its_camera(candidate.query, result):
+            refused = rules.Refusal.UNSUPPORTED
         if refused is None and surveyed is not None:
             refused = await self._refusal_by_pixels(candidate, place, surveyed, result, options)
         if refused is None and surveyed is not None:

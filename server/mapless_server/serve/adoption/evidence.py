@@ -10,6 +10,7 @@ from mapless.scenes import AdoptionPolicy
 from mapless_server.engine.group_cameras import read_with
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Query, Result
 from mapless_server.method.bundle.estimate import PosedSupport
+from mapless_server.method.bundle.intrinsics import DOUBTED_SIGMAS
 from mapless_server.method.judge.answer import Localization
 from mapless_server.method.options import LocalizeOptions
 from mapless_server.method.pose.pnp import MIN_MATCHES, PnpOptions, ransac
@@ -43,13 +44,17 @@ def evidence_of(query: Query, result: Result) -> Evidence | None:
     )
 
 
-def evidence_as_kept(query: Query, result: Result) -> Evidence | None:
-    """The evidence of a kept photograph; None, too, if its pose is with another camera than it is kept with.
+def has_its_camera(query: Query, result: Result) -> bool:
+    """Whether the matches of a kept photograph show no other camera than it is kept with.
 
-    That is so where its matches contradict the intrinsics that its caller stated.
+    They do where its pose is with a camera that they correct, and where they show an error that is significant by what
+    this photograph alone says: its pose takes such an error up, but the reference would keep it.
     """
-    camera = used_camera(result, query.options, query.photo)
-    return evidence_of(query, result) if camera is not None and camera.camera == query.photo.camera else None
+    camera, support = used_camera(result, query.options, query.photo), result.answer.support
+    if camera is None or camera.camera != query.photo.camera or not isinstance(support, PosedSupport):
+        return False
+    found = support.estimate.intrinsics
+    return found is None or bool((np.abs(found.value) <= DOUBTED_SIGMAS * found.sigma).all())
 
 
 def kept_query(query: Query, result: Result, policy: AdoptionPolicy, coverage: float) -> Query | None:
