@@ -153,11 +153,11 @@ def test_a_tree_is_made_once_per_generation() -> None:
     index = SceneIndex(4)
     added = [IndexedReference(name, f"key-{name}", HERE, None) for name in "abc"]
     index.apply(SceneChanges(1, tuple(added[:2]), frozenset(), True))
-    rows, first = surveyed_viewpoints(index.entries(), ["key-b"])
+    rows, first = surveyed_viewpoints(index.entries(), lambda: ["key-b"])
     assert rows.tolist() == [0]
-    assert surveyed_viewpoints(index.entries(), ["key-b"])[1] is first
+    assert surveyed_viewpoints(index.entries(), lambda: ["key-b"])[1] is first
     index.apply(SceneChanges(2, tuple(added[2:]), frozenset(), False))
-    assert surveyed_viewpoints(index.entries(), ["key-b"])[0].tolist() == [0, 2]
+    assert surveyed_viewpoints(index.entries(), lambda: ["key-b"])[0].tolist() == [0, 2]
 
 
 def contradicted(days: int, *holders: str, each: int = 1) -> Standing:

@@ -180,6 +180,8 @@ def test_adopted_references_are_listed_by_usefulness(place: Place) -> None:
         at_a = hall(store)["a"]
         keys = {name: adopt(store, adopted(name, it), 9)[0].key for name, it in (("x", 0.3), ("y", 0.1))}
         assert [it.reference_id for it in adoption.list_adopted(store.database, HALL)] == ["y", "x"]
+        assert adoption.list_adopted_at(store.database, [at_a]) == adoption.list_adopted(store.database, HALL)
+        assert adoption.list_adopted_at(store.database, ["elsewhere"]) == []
         adoption.set_usefulness(store.database, {keys["y"]: 0.5, "gone": 0.1})
         found = adoption.list_adopted(store.database, HALL)
         assert [(it.reference_id, it.usefulness, it.place_key) for it in found] == [

@@ -14,7 +14,7 @@ from dataclasses import replace
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, bindparam, func, select, update
+from sqlalchemy import ColumnElement, Connection, Row, Select, bindparam, func, select, update
 
 from mapless.provenance import ADOPTED
 from mapless_server.security import SceneKey
@@ -102,12 +102,21 @@ def adopt(
 
 def list_adopted(database: Database, scene_key: SceneKey) -> list[Adopted]:
     """The adopted references of a scene, the least useful first; empty if there is no such scene."""
+    return _list_adopted(database, reference.c.scene_id == scene_key)
+
+
+def list_adopted_at(database: Database, place_keys: Collection[str]) -> list[Adopted]:
+    """The adopted references at places, the least useful first; reads no others, however many a scene has."""
+    return _list_adopted(database, adopted_reference.c.place_key.in_(sorted(place_keys)))
+
+
+def _list_adopted(database: Database, are_wanted: ColumnElement[bool]) -> list[Adopted]:
     column, standing = adopted_reference.c, reference_standing.c
     statement: Select[Any] = (
         select(reference.c.reference_id, adopted_reference, standing.retire_time_us)
         .join(adopted_reference, column.reference_key == reference.c.key)
         .outerjoin(reference_standing, standing.reference_key == reference.c.key)
-        .where(reference.c.scene_id == scene_key)
+        .where(are_wanted)
         .order_by(column.usefulness, column.adopt_time_us, reference.c.reference_id)
     )
     with database.read() as connection:

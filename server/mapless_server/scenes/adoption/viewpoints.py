@@ -1,7 +1,7 @@
 """The viewpoints of a scene's surveyed references: which stand nearest to a photograph, and whose place it is."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 from weakref import WeakKeyDictionary
 
@@ -93,16 +93,16 @@ _kept: WeakKeyDictionary[Entries, tuple[Rows, Viewpoints]] = WeakKeyDictionary()
 """Trees by generation of a scene, as long as it is in memory: to make one of 100,000 takes 50 ms."""
 
 
-def surveyed_viewpoints(entries: Entries, adopted_keys: Iterable[str]) -> tuple[Rows, Viewpoints]:
+def surveyed_viewpoints(entries: Entries, adopted_keys: Callable[[], Iterable[str]]) -> tuple[Rows, Viewpoints]:
     """Rows (N,) of a scene's surveyed references in use, ascending, and their viewpoints, of these rows.
 
     Args:
         entries: the references in use at one generation.
-        adopted_keys: keys of those that were adopted, read from the store after `entries`.
+        adopted_keys: reads the keys of those that were adopted, where they are not known of these entries.
     """
     found = _kept.get(entries)
     if found is None:
-        its = list(entries.rows_of_keys(list(adopted_keys)).values())
+        its = list(entries.rows_of_keys(list(adopted_keys())).values())
         rows = np.setdiff1d(entries.rows(), its, assume_unique=True)
         found = _kept[entries] = rows, Viewpoints(entries.centres(rows), entries.axes(rows))
     return found

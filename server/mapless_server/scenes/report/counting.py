@@ -59,7 +59,7 @@ class Places:
         """Makes the object of a scene's references in use, and all of its adopted ones."""
         self._entries = entries
         self._adopted = {it.reference_id: it for it in adopted}
-        self._rows, self._viewpoints = surveyed_viewpoints(entries, (it.key for it in self._adopted.values()))
+        self._rows, self._viewpoints = surveyed_viewpoints(entries, lambda: [it.key for it in self._adopted.values()])
 
     def is_surveyed(self, reference_id: str) -> bool:
         """Whether a reference was not adopted."""

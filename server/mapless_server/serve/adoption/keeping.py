@@ -157,7 +157,7 @@ class Keeper:
         made = await asyncio.to_thread(adoption.change_standings, database, place.id_of, learned)
         outdated = [key for key, it in made.items() if it.outdate_time_us is not None]
         adopted = [
-            it for it in await asyncio.to_thread(adoption.list_adopted, database, scene_key) if not it.is_retired
+            it for it in await asyncio.to_thread(adoption.list_adopted_at, database, place.id_of) if not it.is_retired
         ]
         leaving = [it.key for it in adopted if it.place_key in outdated]
         await self._retire(scene_key, leaving, RetirementReason.SURVEY_OUTDATED)

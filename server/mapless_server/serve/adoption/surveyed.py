@@ -109,7 +109,9 @@ class SurveyedLocalizer:
         return self._engine.references.retrievals[0].indexes.entries(scene_key, context, waits=False)
 
     def _surveyed(self, scene_key: SceneKey, entries: Entries) -> tuple[Rows, Viewpoints]:
-        adopted = (it.key for it in adoption.list_adopted(self._store.database, scene_key))
+        def adopted() -> list[str]:
+            return [it.key for it in adoption.list_adopted(self._store.database, scene_key)]
+
         return surveyed_viewpoints(entries, adopted)
 
     async def localized(
