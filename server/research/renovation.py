@@ -41,9 +41,9 @@ PHOTOGRAPHS = 40
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "renovation.md"
 RIGHT_PX = 4.0
 """Farthest projection of the point of a right match, by the true pose, pixels of the photograph."""
-BUILDING, WEEK_LATER, SURVEYED_AGAIN = STEPS + 1, STEPS + 2, STEPS + 3
-"""The steps after the ten: the building's surfaces are exchanged, the same room a week later, and after a new survey,
-when the photographs of the first of these weeks are asked for again."""
+BUILDING, LAST_WEEK, SURVEYED_AGAIN = STEPS + 1, STEPS + 4, STEPS + 5
+"""The steps after the ten: the building's surfaces are exchanged, the same room for three weeks more, and after a new
+survey, when the photographs of the first of these weeks are asked for again."""
 DAYS = 7.0
 """Length of a step."""
 
@@ -51,7 +51,7 @@ DAYS = 7.0
 def render(folder: Path, seed: int, count: int) -> None:
     """Renders surveys and steps where they are missing."""
     renovation = Renovation(seed)
-    for step in range(WEEK_LATER + 1):
+    for step in range(LAST_WEEK + 1):
         target = folder / f"step-{step:02d}"
         if (target / "share").is_file():
             continue
@@ -81,7 +81,7 @@ class Run:
     def __init__(self, folder: Path, seed: int, count: int) -> None:
         """Prepares the photographs in a folder, so many of each step."""
         self._folder = folder
-        self._frames = [frames_of(folder, step, count) for step in range(WEEK_LATER + 1)]
+        self._frames = [frames_of(folder, step, count) for step in range(LAST_WEEK + 1)]
         self._frames.append(self._frames[BUILDING])
         self._surveyed = SurveyedPoints(seed, read_folder(folder / "survey").frames)
 
@@ -127,7 +127,7 @@ class Run:
                 held += errors[-1] <= kept.provenance.accuracy.position_95_m
         result = StepResult(
             step,
-            float((self._folder / f"step-{min(step, WEEK_LATER):02d}" / "share").read_text()),
+            float((self._folder / f"step-{min(step, LAST_WEEK):02d}" / "share").read_text()),
             tuple(seen),
             tuple(errors),
             held,
