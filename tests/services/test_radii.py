@@ -7,8 +7,16 @@ import numpy as np
 import pytest
 from support.scenes import random_for
 
+from mapless.geometry import RigidTransform
 from mapless.scenes import Calibration
-from mapless_server.method.bundle.estimate import USUAL_GAP, Accuracy, accuracy_from_covariance
+from mapless_server.method.bundle.estimate import (
+    USUAL_GAP,
+    Accuracy,
+    PoseEstimate,
+    PoseStage,
+    accuracy_from_covariance,
+    with_information,
+)
 from mapless_server.services.messages.radii import (
     Conditions,
     Factors,
@@ -66,6 +74,27 @@ def test_what_adopted_references_are_off_is_not_scaled(share: float) -> None:
     np.testing.assert_allclose(found.covariance, (1 - kept) * scaled + kept * COVARIANCE, atol=1e-9)
     expected_m = math.sqrt(4 * (1 - kept) + kept) * before.position_68_m
     assert found.accuracy.position_68_m == pytest.approx(expected_m, rel=1e-3)
+
+
+def test_a_prior_does_not_scale_what_adopted_ones_are_off() -> None:
+    """The prior is along z alone: along x and y references are as far off as before."""
+    everything, theirs = np.diag([1e-4] * 3 + [1e-6] * 3), np.diag([9e-5] * 3 + [0.0] * 3)
+    alone = PoseEstimate(
+        RigidTransform.identity(),
+        PoseStage.REFINED,
+        np.ones(9, bool),
+        np.ones(9),
+        everything,
+        reference_covariance=theirs,
+    )
+    informed = with_information(alone, np.diag([0.0, 0.0, 1e8, 0.0, 0.0, 0.0]))
+    attributes = SceneAttributes(calibration=replace(MEASURED, position_factor_68=0.1, position_factor_95=0.1))
+    before, theirs_after = accuracy_from_covariance(informed.covariance), informed.reference_covariance
+    found = reported_radii(before, informed.covariance, SIFT, KIND, attributes, USUAL_GAP, theirs_after)
+    np.testing.assert_allclose(np.diag(found.covariance)[:2], 0.01 * 1e-5 + 9e-5)
+    assert found.covariance[2, 2] < 1e-8
+    least_m = accuracy_from_covariance(np.diag([9e-5, 9e-5, 0.0, 0.0, 0.0, 0.0])).position_68_m
+    assert found.accuracy.position_68_m == pytest.approx(least_m, rel=2e-3)
 
 
 def test_measured_ones_win_over_those_of_references() -> None:

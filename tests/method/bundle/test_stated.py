@@ -11,8 +11,9 @@ from mapless.answers import Accuracy
 from mapless.geometry import Array, RigidTransform
 from mapless.provenance import ADOPTED, Provenance, Voucher
 from mapless_server.method.bundle.adjust import adjust_pose
-from mapless_server.method.bundle.estimate import PoseEstimate, accuracy_from_covariance
+from mapless_server.method.bundle.estimate import PoseEstimate, accuracy_from_covariance, with_information
 from mapless_server.method.bundle.pose_problem import AdjustInput, AdjustOptions, pose_errors
+from mapless_server.method.bundle.priors import PositionPrior, Priors
 from mapless_server.method.features.views import PosedView
 from mapless_server.method.optim.optimize import covariance_in_world, moved
 from mapless_server.method.optim.rotations import rotation_vector
@@ -33,8 +34,13 @@ def covariance_of(case: str, position_m: float, rotation_rad: float) -> Array:
     return np.asarray(scale[:, None] * (root @ root.T + 0.1 * np.eye(6)) * scale)
 
 
-def answer(case: str, count: int, covariance: Array, error: Array) -> tuple[PoseEstimate, RigidTransform]:
-    """The adjusted pose where the first references are adopted and off by an error (6,) in the world; the truth."""
+def answer(
+    case: str, count: int, covariance: Array, error: Array, sigma_m: Array | None = None
+) -> tuple[PoseEstimate, RigidTransform]:
+    """The adjusted pose where the first references are adopted and off by an error (6,) in the world; the truth.
+
+    With standard deviations (3,) there is a prior at the true position.
+    """
     scene = make_scene(random_for(case), OPTIONS)
 
     def view(i: int, it: PosedView) -> PosedView:
@@ -45,7 +51,9 @@ def answer(case: str, count: int, covariance: Array, error: Array) -> tuple[Pose
     references = tuple(view(i, it) for i, it in enumerate(scene.references))
     structure, matches, estimate = stages(scene, references)
     given = AdjustInput(scene.query, references, structure, matches, AdjustOptions())
-    return adjust_pose(given, estimate), scene.world_from_query
+    truth = scene.world_from_query
+    known = None if sigma_m is None else PositionPrior(truth.translation, np.diag(sigma_m**2))
+    return adjust_pose(given, estimate, Priors(known)), truth
 
 
 def test_a_stated_covariance_is_of_its_reference_in_the_world() -> None:
@@ -83,3 +91,26 @@ def test_errors_are_as_large_as_planted_common_ones_say(count: int) -> None:
         off = np.concatenate([pose.translation - truth.translation, turn])
         ratios.append(off @ np.linalg.solve(found.covariance, off) / 6)
     assert 0.2 < np.mean(ratios) < 1.3
+
+
+def test_a_prior_along_one_axis_leaves_what_is_off_along_others() -> None:
+    covariance = np.diag([0.03] * 3 + [0.004] * 3) ** 2
+    given = "prior", OPTIONS.reference_count, covariance, np.zeros(6)
+    alone, informed = (answer(*given, sigma_m)[0] for sigma_m in (None, np.array([10.0, 10.0, 1e-4])))
+    before, after = alone.reference_covariance, informed.reference_covariance
+    assert before is not None
+    assert after is not None
+    assert after[2, 2] < 1e-3 * before[2, 2]
+    np.testing.assert_allclose(np.diag(after)[:2], np.diag(before)[:2], rtol=0.2)
+    assert np.linalg.eigvalsh(informed.covariance - after).min() > -1e-15
+
+
+def test_a_sharper_covariance_contains_its_part_by_references() -> None:
+    estimate, _ = answer("contained", OPTIONS.reference_count, covariance_of("contained", 0.03, 0.004), np.zeros(6))
+    for seed in range(200):
+        random = random_for("contained", seed)
+        part, rest, root = (random.normal(size=(6, count)) for count in (3, 6, 1 + seed % 6))
+        planted = replace(estimate, covariance=part @ part.T + rest @ rest.T, reference_covariance=part @ part.T)
+        found = with_information(planted, 10.0 ** random.uniform(-3, 4) * root @ root.T)
+        assert found.reference_covariance is not None
+        assert np.linalg.eigvalsh(found.covariance - found.reference_covariance).min() > -1e-9

@@ -28,7 +28,7 @@ from ..features.views import PosedView
 from ..structure.model import MetricScale
 from ..structure.structure import query_tracks, with_query_points
 from .dispersion import scale_covariance
-from .estimate import PosedSupport, PoseEstimate, PoseStage
+from .estimate import PosedSupport, PoseEstimate, PoseStage, with_information
 from .intrinsics import (
     DOUBTED_SIGMAS,
     PRINCIPAL,
@@ -222,7 +222,9 @@ def _with_priors(alone: PoseEstimate, where: Solved, priors: Priors) -> PoseEsti
 
 
 def _sharpened(found: PoseEstimate, priors: Priors) -> PoseEstimate:
-    return replace(found, covariance=priors.sharpened(found.covariance, found.world_from_camera))
+    if not priors:
+        return found
+    return with_information(found, priors.gradient_and_information(found.world_from_camera)[1])
 
 
 def _of_matches(found: PoseEstimate, count: int) -> PoseEstimate:
@@ -328,8 +330,7 @@ def with_covariance(
     if is_initial or points_are_predicted:
         centroid = np.mean([it.world_from_camera.translation for it in references], axis=0)
         covariance = covariance + scale_covariance(pose, centroid, scale.deviation)
-    covariance = priors.consistent(estimate.prior_checks).sharpened(covariance, pose)
-    found = replace(errors, covariance=covariance).on(estimate)
+    found = _sharpened(replace(errors, covariance=covariance).on(estimate), priors.consistent(estimate.prior_checks))
     if errors.intrinsics is None:
         return found
     # The pose stays as it is; but an error is not seen in full before it is estimated.

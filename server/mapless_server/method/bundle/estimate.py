@@ -20,7 +20,7 @@ from mapless.geometry import Array, Camera, RigidTransform
 from ..features.views import Matches, PosedView, ReferenceErrors, View
 from ..significance import HEAVY_TAIL
 from ..structure.model import PointMatches, Structure
-from .priors import IntrinsicsSigma, PriorCheck
+from .priors import IntrinsicsSigma, PriorCheck, sharpened
 
 if TYPE_CHECKING:  # services do not load what computes
     from .intrinsics import IntrinsicsEvidence
@@ -252,6 +252,20 @@ def accuracy_from_covariance(covariance: Array) -> Accuracy:
     rotation_68, rotation_95 = error_radii(covariance[3:, 3:], shares).tolist()
     radii_deg = math.degrees(rotation_68), TAIL_95 * math.degrees(rotation_95)
     return Accuracy(position_68_m, TAIL_95 * position_95_m, *radii_deg)
+
+
+def with_information(estimate: PoseEstimate, information: Array) -> PoseEstimate:
+    """An estimate of whose pose other data give this information J (6, 6), too, so that less of its errors remains.
+
+    The covariance C becomes C' = (C^-1 + J)^-1. Of an error of the estimate K = C' C^-1 = (I + C J)^-1 remains, so the
+    part R by adopted references becomes K R K^T.
+    """
+    covariance, theirs = sharpened(estimate.covariance, information), estimate.reference_covariance
+    if theirs is not None:
+        # C' contains it as C contains R: K R K^T <= K C K^T = C' C^-1 C' <= C'.
+        remaining = np.linalg.inv(np.eye(6) + estimate.covariance @ information)
+        theirs = remaining @ theirs @ remaining.T
+    return replace(estimate, covariance=covariance, reference_covariance=theirs)
 
 
 JACKKNIFE_SHARE = 0.6

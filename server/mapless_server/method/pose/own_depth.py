@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from mapless.geometry import Array
 
-from ..bundle.estimate import DepthCheck, PosedSupport, PoseEstimate, Support
+from ..bundle.estimate import DepthCheck, PosedSupport, PoseEstimate, Support, with_information
 from ..bundle.pose_problem import DRIFT_INFLATION, USUAL_DRIFT
-from ..bundle.priors import LIKELY_PROBABILITY, conflict_threshold, sharpened
+from ..bundle.priors import LIKELY_PROBABILITY, conflict_threshold
 from ..features.tracks import Tracks
 from ..features.views import PosedView
 from ..optim.optimize import cauchy_weight, moved, normal_sigma, solve_columns, symmetric_products
@@ -208,11 +208,10 @@ def _improved(estimate: PoseEstimate, comparison: DepthComparison) -> PoseEstima
     gain = float(np.abs(np.linalg.eigvals(information @ estimate.covariance)).max())
     if not gain >= 1:
         return estimate
-    covariance = sharpened(estimate.covariance, information)
+    better = with_information(estimate, information)
     return replace(
-        estimate,
-        world_from_camera=moved(estimate.world_from_camera, covariance @ gradient),
-        covariance=covariance,
+        better,
+        world_from_camera=moved(estimate.world_from_camera, better.covariance @ gradient),
         without_priors=estimate.without_priors or estimate,
         depth_check=replace(check, used=True),
     )

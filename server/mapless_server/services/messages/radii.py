@@ -106,8 +106,8 @@ def reported_radii(
 
         C' = D (C - R) D + R,    D = diag(fp, fp, fp, fr, fr, fr),
 
-    and the squares of the radii likewise. Priors may have made C smaller than R: then it is as large a share of R as C
-    contains.
+    and the squares of the radii likewise. C contains R, but for rounding, and where a group of photographs determines
+    the pose better than the one that R is of: then R counts by the largest share that C contains.
 
     Args:
         accuracy: radii of the method.
