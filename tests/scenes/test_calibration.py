@@ -290,6 +290,12 @@ class TestScenes:
         assert found == replace(surveyed, generation=found.generation)
         assert found.answer_count < usual.answer_count
 
+    def test_adopted_ones_alone_say_nothing(self, store: Store) -> None:
+        add(store, REFERENCES)
+        adopted, calibrator = [f"r{i}" for i in range(len(REFERENCES))], Server(store).calibrator
+        found = calibrator.calibrate(SCENE, ReferenceLibrary(store), [], lambda: None, adopted=adopted)
+        assert found.answer_count == 0
+
     def test_the_time_is_bounded(self, store: Store) -> None:
         add(store, REFERENCES)
         found = Server(store, max_cpu_s=1e-9).run()

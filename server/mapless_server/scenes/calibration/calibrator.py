@@ -71,13 +71,13 @@ class _Surveyed:
     Attributes:
         scene_key: the scene.
         entries: its references in use, of one generation.
-        ids: those that were not adopted; empty if none was.
+        ids: those that were not adopted; None for all.
         library: with their features.
     """
 
     scene_key: SceneKey
     entries: Entries
-    ids: Collection[str]
+    ids: Collection[str] | None
     library: ReferenceLibrary
 
     @classmethod
@@ -85,7 +85,9 @@ class _Surveyed:
         cls, scene_key: SceneKey, entries: Entries, adopted: Collection[str], library: ReferenceLibrary
     ) -> "_Surveyed":
         """The references of a scene without the `adopted`, given by id."""
-        ids = (entries.reference(row)[0] for row in entries.rows().tolist()) if adopted else ()
+        if not adopted:
+            return cls(scene_key, entries, None, library)
+        ids = (entries.reference(row)[0] for row in entries.rows().tolist())
         return cls(scene_key, entries, [it for it in ids if it not in adopted], library)
 
 
@@ -165,7 +167,7 @@ class Calibrator:
 
     def _sample(self, surveyed: _Surveyed, newest: Sequence[str], count: int) -> list[str]:
         """Ids of so many references to leave out: the newest and the worst covered by turns."""
-        entries, rows = surveyed.entries, surveyed.entries.rows(surveyed.ids or None)
+        entries, rows = surveyed.entries, surveyed.entries.rows(surveyed.ids)
         if len(rows) < LEAST_REFERENCES:
             return []
         centres = entries.centres(rows)

@@ -182,11 +182,17 @@ def _similar(entries: Entries, narrowing: Narrowing, vector: Vector, count: int)
     return entries.similarities(vector, rows) if entries.is_exact else entries.similar(vector, rows, count).similarity
 
 
-def rank_beside(entries: Entries, reference_id: str, count: int, among: Collection[str] = ()) -> list[RankedReference]:
+def rank_beside(
+    entries: Entries, reference_id: str, count: int, among: Collection[str] | None = None
+) -> list[RankedReference]:
     """The other references that a query from the place of one of the entries would choose, in the order of choice.
 
-    `among` are ids of the candidates; empty for the whole scene.
+    `among` are ids of the candidates; None for the whole scene.
     """
+    if among is None:
+        among = ()
+    elif not among:
+        return []
     (row,) = entries.rows([reference_id])
     selection = Selection(count + 1, among=among, options=THINNED_LATER)
     ranked = rank_references(entries, entries.vector(row), selection)
