@@ -45,7 +45,7 @@ class Provenance:
             "ADOPTED" from a localized photograph; "UNSPECIFIED" where a server before 0.4 answers.
         accuracy: errors of the pose against the poses of the scene's other references, at most 1000 m and 180 degrees;
             None if unknown, which it is not for a reference that was placed or adopted.
-        surveyed_share: of an adopted one, the share of its photograph's matches that surveyed references supported,
+        surveyed_share: of an adopted one, the share of what its answer explained that the survey explained alone,
             above 0, at most 1; else 0.
         vouchers: of an adopted one, the surveyed references that its pose rests on, at most 64; else empty.
         covariance: of the same errors as `accuracy`, which it requires: six rows of six, order x y z rx ry rz, metres

@@ -85,7 +85,7 @@ class PlaceState:
     """What photographs that were considered for adoption showed of the place of a surveyed reference.
 
     Attributes:
-        surveyed_share: share of their matches that surveyed references supported, 0 to 1, a running mean.
+        surveyed_share: share of what their matches explain that the survey explains alone, 0 to 1; the median of ten.
         photograph_count: photographs of the place, see `PlaceReport`.
         contradiction_count: photographs in a row that should show what the surveyed reference shows, and do not.
         is_outdated: whether they show too little of what was surveyed, so that the place needs a new survey.

@@ -114,7 +114,7 @@ class AdoptionPolicy:
         max_radius_m: largest 68 % radius of an answer's position: 1e-6 to 10 metres, or above 0 in the scene's
             arbitrary unit, where the server refuses None (InvalidArgument). None is 0.03 m; a server's answer has the
             number.
-        min_surveyed_share: least share of a photograph's matches that surveyed references support, 0.1 to 1. Where
+        min_surveyed_share: least share of what an answer explains that the survey explains alone, 0.1 to 1. Where
             photographs of a place have less, its adopted references are retired until there is a new survey.
     """
 

@@ -52,7 +52,19 @@ def evidence(
     ],
 )
 def test_a_photograph_needs_surveyed_support(answered: Evidence, surveyed: Evidence | None, refused: Refusal) -> None:
-    assert rules.refusal(POLICY, answered, surveyed, OPTIONS) == refused
+    share = 0.0 if surveyed is None else surveyed.inlier_count / answered.inlier_count
+    assert rules.refusal(POLICY, answered, surveyed, share, OPTIONS) == refused
+
+
+def test_more_matches_of_what_the_survey_explains_leave_its_share() -> None:
+    """So adopted references, which find more of what has not changed, make no survey look outdated."""
+    surveyed, size = np.array([[100.0, 100.0], [400.0, 300.0]]), (640, 480)
+    nearby = np.concatenate([surveyed + [dx, dy] for dx in (-2, 0, 2) for dy in (-2, 0, 2)])
+    assert rules.surveyed_share(size, nearby, surveyed, OPTIONS) > 0.8
+    elsewhere = np.concatenate([nearby, nearby + [120.0, 60.0]])
+    assert 0.4 < rules.surveyed_share(size, elsewhere, surveyed, OPTIONS) < 0.5
+    assert rules.surveyed_share(size, surveyed, np.empty((0, 2)), OPTIONS) == 0.0
+    assert rules.surveyed_share(size, np.empty((0, 2)), surveyed, OPTIONS) == 0.0
 
 
 def test_what_no_match_explains_is_new() -> None:
@@ -109,6 +121,14 @@ def test_one_holder_outdates_no_place_that_others_confirm() -> None:
         known = shown(known, 0.9, 1, "one")
     assert not rules.needs_survey(known, POLICY, OPTIONS)
     assert known.surveyed_share == pytest.approx(0.45)
+
+
+def test_one_holder_keeps_no_place_current_that_two_see_changed() -> None:
+    known = Standing()
+    for _ in range(10):
+        known = shown(known, 1.0, 1, "attacker", each=20)
+        known = shown(known, 0.1, 1, "one", "two")
+    assert rules.needs_survey(known, POLICY, OPTIONS)
 
 
 def test_a_busy_day_leaves_days_before_remembered() -> None:
@@ -208,3 +228,5 @@ def test_a_holder_is_a_token_of_a_tenant() -> None:
 
 def test_usefulness_is_a_running_mean() -> None:
     assert rules.with_usefulness(0.2, 0.0, OPTIONS) == pytest.approx(0.18)
+    assert rules.with_usefulness(0.1, 1.0, OPTIONS, is_own=True) == pytest.approx(0.11)  # as a new one
+    assert rules.with_usefulness(0.8, 1.0, OPTIONS, is_own=True) == 0.8  # as others have found it

@@ -20,7 +20,7 @@ from mapless_server.engine.query import Photo
 from mapless_server.engine.queue_engine import QueueEngine
 from mapless_server.errors import DataLoss
 from mapless_server.method.bundle.priors import IntrinsicsSigma
-from mapless_server.scenes.adoption.policy import AdoptionOptions, Evidence, Refusal
+from mapless_server.scenes.adoption.policy import AdoptionOptions, Refusal
 from mapless_server.security import SceneKey
 from mapless_server.serve.adoption import adopter as module
 from mapless_server.serve.adoption import waiting
@@ -213,13 +213,13 @@ def test_a_flood_by_one_token_makes_nothing_useless(held: Held) -> None:
     assert only.usefulness == pytest.approx(0.8 * 0.9)
 
 
-def _learned(held: Held, candidate: Candidate, surveyed: Evidence | None, day: int) -> None:
-    """Counts what a photograph says of its place on a day, where the survey alone localizes it so."""
+def _learned(held: Held, candidate: Candidate, share: float, day: int) -> None:
+    """Counts what a photograph says of its place on a day, where the survey alone explains so much of it."""
     options, now = AdoptionOptions(), datetime.now(timezone.utc) + timedelta(days=day)
     pose, distance_m = candidate.answered.world_from_camera, candidate.distance_m
     place = held.adopter._localizer.place(ROOM, pose, distance_m, options)
     assert place is not None
-    learning = held.adopter._keeper.learn(candidate, place, surveyed, POLICY, now, options)
+    learning = held.adopter._keeper.learn(candidate, place, share, POLICY, now, options)
     asyncio.run_coroutine_threadsafe(learning, held.loop).result(60)
 
 
@@ -230,20 +230,38 @@ def test_ones_own_photographs_keep_no_place_full(held: Held) -> None:
     (only,) = adoption.list_adopted(held.store.database, ROOM)
     found = replace(robot.answered, inliers_of={only.reference_id: robot.answered.inlier_count})
     for day, holder in enumerate(["robot"] * 4 + ["other"] * 4, 1):
-        _learned(held, replace(robot, holder=holder, answered=found), robot.answered, day)
+        _learned(held, replace(robot, holder=holder, answered=found), 1.0, day)
         (only,) = adoption.list_adopted(held.store.database, ROOM)
         assert (only.usefulness > 0.2) is (holder == "other")
 
 
 def test_an_answer_from_the_survey_alone_shows_that_it_is_there(held: Held) -> None:
     """Also where it needs the call's priors, without which the survey does not suffice."""
-    candidate = held.candidate(held.place.queries[0])
-    with_another = {**candidate.answered.inliers_of, "adopted": 1}
-    adopted = replace(candidate, answered=replace(candidate.answered, inliers_of=with_another))
-    for day, (its, mean) in enumerate([(candidate, 1.0), (adopted, 0.5)]):
-        _learned(held, its, None, day)
+    answered = held.candidate(held.place.queries[0])
+    assert answered.by_survey
+    for its, share in ((replace(_without_survey(answered), by_survey=True), 1.0), (_without_survey(answered), 0.5)):
+        assert held.consider(replace(its, holder=str(share))) is Refusal.UNSUPPORTED
         (first, *_) = [it.place for it in held.client.list_references("room") if it.place is not None]
-        assert first.surveyed_share == mean
+        assert first.surveyed_share == share  # the median
+
+
+def _without_survey(answered: Candidate) -> Candidate:
+    """An answer by adopted references to a photograph that the survey does not localize."""
+    camera = answered.query.photo.camera
+    noise = np.random.default_rng(0).integers(0, 255, (camera.height_px, camera.width_px, 3), np.uint8)
+    query = replace(answered.query, photo=replace(answered.query.photo, image=cv2.imencode(".png", noise)[1].tobytes()))
+    return replace(answered, query=query, as_stated=query, by_survey=False)
+
+
+def test_a_robot_that_stands_still_outdates_nothing(held: Held) -> None:
+    """What was adopted where it stands gives its photographs most of their matches, and nothing has changed."""
+    query = held.place.queries[2]
+    assert held.consider(held.candidate(query)) is None
+    candidate = held.candidate(_noisy(query))
+    assert not candidate.by_survey
+    assert held.consider(candidate) is not None
+    shares = [it.place.surveyed_share for it in held.client.list_references("room") if it.place is not None]
+    assert min(shares) > 0.6
 
 
 def _pixels(photograph: Photograph) -> NDArray[np.uint8]:
@@ -350,14 +368,13 @@ def test_a_damaged_index_ends_no_other_scenes_places(held: Held, monkeypatch: py
 
 def test_a_place_with_too_little_survey_left_is_named(held: Held) -> None:
     assert held.consider(held.candidate(held.place.queries[0])) is None
-    candidate, now = held.candidate(held.place.queries[0]), datetime.now(timezone.utc)
-    crowded = replace(candidate, answered=replace(candidate.answered, inlier_count=10_000))
+    now, unsupported = datetime.now(timezone.utc), _without_survey(held.candidate(held.place.queries[0]))
     held.adopter._options = AdoptionOptions(least_photographs=2, contradicting_days=2, remembered=2)
     try:
         for day in (1, 2):
             assert held.store.list_retirements(ROOM, held.adopted) == {}
             held.adopter._now = partial(now.__add__, timedelta(days=day))
-            assert held.consider(crowded) in (Refusal.LITTLE_SURVEYED, Refusal.UNSUPPORTED)
+            assert held.consider(unsupported) is Refusal.UNSUPPORTED
     finally:
         held.adopter._now, held.adopter._options = lambda: datetime.now(timezone.utc), None
     (retired,) = held.store.list_retirements(ROOM, held.adopted).values()
@@ -531,7 +548,9 @@ def test_a_wrong_lens_that_matches_correct_is_not_kept(held: Held) -> None:
     candidate = _asked(held, query.data, camera, IntrinsicsUncertainty(k1_sigma=0.1))
     error_m, _ = pose_error(query.world_from_camera, candidate.answered.world_from_camera)
     assert error_m < candidate.answered.position_95_m
-    assert held.consider(candidate) is Refusal.UNSUPPORTED
+    assert held.consider(replace(candidate, by_survey=False)) is Refusal.UNSUPPORTED
+    (place, *_) = [it.place for it in held.client.list_references("room") if it.place is not None]
+    assert place.surveyed_share > 0.9  # of the place it says nothing
     estimated = replace(candidate.query.options, intrinsics=IntrinsicsSigma(k1=0.1))
     assert held.consider(replace(candidate, query=replace(candidate.query, options=estimated))) is Refusal.UNSUPPORTED
 

@@ -27,7 +27,8 @@ def candidate(
     tenant: str = "one", size_bytes: int = 1, offered_s: float = 0.0, mask: bytes = b"", holder: str = ""
 ) -> Candidate:
     query = SimpleNamespace(scene_key=key_of(tenant, "room"), photo=SimpleNamespace(size_bytes=size_bytes, mask=mask))
-    return Candidate(cast(Query, query), cast(Evidence, None), np.empty((0, 2)), 1.0, holder, offered_s)
+    its, answered = cast(Query, query), cast(Evidence, None)
+    return Candidate(its, its, answered, True, np.empty((0, 2)), 1.0, holder, offered_s)
 
 
 def tenants(waiting: Waiting) -> list[str]:

@@ -39,8 +39,8 @@ async def release_when_idle(tiers: Sequence[Tier], quiet_s: float) -> None:
         now_s = time.process_time()
         least_s = IDLE_SHARE * quiet_s
         if now_s - last_s < least_s < now_s - released_s:
+            released_s = now_s  # what is computed while memory is released needs it again
             await asyncio.to_thread(release_memory, tiers)
-            released_s = time.process_time()
         last_s = now_s
 
 

@@ -132,8 +132,8 @@ class Standing:
         contradiction_count: photographs in a row that should show what it shows, and do not.
         contradiction_time_us: when the last one was counted, microseconds since 1970.
         contradicted_by: the day and the holder of each of the last ones, see `adoption.policy.with_photograph`.
-        surveyed_share: of a surveyed one, the share of matches with surveyed references in photographs of its place,
-            mean over the last ones; None without any.
+        surveyed_share: of a surveyed one, the share of what answers of its place explain that the survey explains
+            alone: the median of the last ones; None without any.
         photograph_count: photographs of its place that were counted.
         surveyed_by: day, holder and share of the last ones, see `adoption.policy.with_share`.
         outdate_time_us: since when its place needs a new survey, microseconds since 1970; None if it does not.

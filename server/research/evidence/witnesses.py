@@ -103,7 +103,7 @@ def _share(retired: Sequence[int | None]) -> str:
 
 
 OUTDATED = ((5, 3, 3), (5, 5, 3), (10, 5, 1), (10, 5, 3), (10, 5, 10), (10, 10, 3), (20, 10, 3))
-"""Photographs that a mean remembers, least with too small a share, and photographs that count a day."""
+"""Photographs that a median remembers, least with too small a share, and photographs that count a day."""
 POLICY = AdoptionPolicy()
 SPREAD = 0.15
 """Standard deviation of a photograph's share of surveyed support from that of its place."""

@@ -42,7 +42,7 @@ class AdoptionOptions:
         min_novelty: least share of a photograph's keypoints that are not near a match of its answer.
         explained_share: what is so near a match is explained by it, share of the image's longer side.
         first_usefulness: most usefulness of a new reference, so that it cannot at once push out one that proved useful.
-        remembered: photographs that a mean remembers.
+        remembered: photographs that medians and means remember.
         least_photographs: least photographs of a place with too small a share of surveyed support before it is said to
             need a new survey; they come on so many days, and from so many holders, as contradictions.
         photographs_a_day: most photographs that count for a place on one day, so that several days are remembered.
@@ -153,17 +153,28 @@ def camera_error_m(camera: Camera, focal_share: float, distance_m: float) -> flo
     return focal_share * distance_m * corner_px / camera.focal_x_px
 
 
-def surveyed_share(answered: Evidence, surveyed: Evidence | None) -> float:
-    """Share of a photograph's matches that surveyed references support, 0 to 1; `surveyed` is the answer from these."""
-    if surveyed is None:
-        return 0.0
-    return min(1.0, surveyed.inlier_count / max(answered.inlier_count, 1))
+def surveyed_share(size_px: tuple[int, int], inliers_px: Array, surveyed_px: Array, options: AdoptionOptions) -> float:
+    """Share of what an answer explains of its photograph that surveyed references explain, too, 0 to 1.
+
+    By area: adopted references add matches where nothing has changed as well, and so would lower a share of matches.
+
+    Args:
+        size_px: width and height of the photograph.
+        inliers_px: (M, 2) the answer's matches.
+        surveyed_px: (S, 2) those of the answer from surveyed references alone; S is 0 without one.
+        options: what is near a match.
+    """
+    by_all, by_survey = (explained(size_px, it, options) for it in (inliers_px, surveyed_px))
+    return float((by_all & by_survey).sum() / max(by_all.sum(), 1))
 
 
 def refusal(
-    policy: AdoptionPolicy, answered: Evidence, surveyed: Evidence | None, options: AdoptionOptions
+    policy: AdoptionPolicy, answered: Evidence, surveyed: Evidence | None, share: float, options: AdoptionOptions
 ) -> Refusal | None:
-    """Why a photograph is not adopted by its answer, and that from surveyed references alone; None if it may be."""
+    """Why a photograph is not adopted by its answer, and that from surveyed references alone; None if it may be.
+
+    `share` is that of `surveyed_share`.
+    """
     if not is_certain(policy, answered):
         return Refusal.UNCERTAIN
     if surveyed is None or not is_certain(policy, surveyed):
@@ -171,7 +182,7 @@ def refusal(
     vouchers = sum(it >= options.voucher_matches for it in surveyed.inliers_of.values())
     if surveyed.inlier_count < options.min_matches or vouchers < options.min_vouchers:
         return Refusal.UNSUPPORTED
-    if surveyed_share(answered, surveyed) < policy.min_surveyed_share:
+    if share < policy.min_surveyed_share:
         return Refusal.LITTLE_SURVEYED
     return None if surveyed.agrees_with(answered) else Refusal.DISAGREES
 
@@ -220,9 +231,9 @@ def with_share(standing: Standing, share: float, now_us: int, holder: str, optio
     if len(today) >= options.photographs_a_day or any(it.split(":")[1] == holder for it in today):
         return standing
     witnesses = (*standing.surveyed_by, f"{day}:{holder}:{100 * share:.0f}")[-options.remembered :]
-    mean = float(np.mean([_share_of(it) for it in witnesses]))
+    median = float(np.median([_share_of(it) for it in witnesses]))  # which less than half of the holders cannot hold up
     count = standing.photograph_count + 1
-    return replace(standing, surveyed_share=mean, photograph_count=count, surveyed_by=witnesses)
+    return replace(standing, surveyed_share=median, photograph_count=count, surveyed_by=witnesses)
 
 
 def _share_of(witness: str) -> float:
@@ -287,9 +298,9 @@ def is_contradicted(standing: Standing, options: AdoptionOptions) -> bool:
 def with_usefulness(usefulness: float, share: float, options: AdoptionOptions, *, is_own: bool = False) -> float:
     """Usefulness of an adopted reference after a photograph of its place that has this share of matches with it.
 
-    One of the holder for whom it was adopted, `is_own`, makes it no more useful than it was at first.
+    One of the holder for whom it was adopted, `is_own`, makes it no more useful than others have, or than a new one is.
     """
-    worth = min(share, options.first_usefulness) if is_own else share
+    worth = min(share, max(usefulness, options.first_usefulness)) if is_own else share
     return usefulness + (worth - usefulness) / options.remembered
 
 

@@ -28,7 +28,16 @@ from mapless_server.scenes.observer import BackgroundObserver
 from mapless_server.security import Principal, SceneKey
 from mapless_server.store import NewReference, Store, adoption, time_us
 
-from .evidence import distance_shown, has_its_camera, inliers_px, kept_query, keypoints_px, rival_count
+from .evidence import (
+    distance_shown,
+    has_its_camera,
+    inliers_px,
+    is_by_survey,
+    kept_query,
+    keypoints_px,
+    rival_count,
+    with_stated_camera,
+)
 from .keeping import Keeper, guarded
 from .surveyed import Place, SurveyedLocalizer
 from .waiting import Candidate, Waiting
@@ -89,7 +98,9 @@ class Adopter:
             self._observer.count_in_scene(result.scene_key, "adoptions", 1, "uncertain")
             return pb.ADOPTION_OFFER_UNCERTAIN
         holder, now_s = rules.holder_of(principal), time.monotonic()
-        candidate = Candidate(kept, evidence, inliers_px(result), distance_shown(result), holder, now_s)
+        as_stated, by_survey = with_stated_camera(kept, query), is_by_survey(result)
+        matches_px, distance_m = inliers_px(result), distance_shown(result)
+        candidate = Candidate(kept, as_stated, evidence, by_survey, matches_px, distance_m, holder, now_s)
         self._observer.count("adoptions", self._waiting.add(candidate), "queue")
         if not rules.is_certain(policy, evidence):  # it is considered for what it says of its place
             return pb.ADOPTION_OFFER_UNCERTAIN
@@ -155,8 +166,9 @@ class Adopter:
             return self._counted(scene_key, rules.Refusal.CHANGED)
         result = await self._localizer.localized(candidate.query, place.surveyed_ids, candidate.query.photo.mask)
         surveyed = self._localizer.evidence(candidate.query, result)
-        is_outdated = await self._keeper.learn(candidate, place, surveyed, policy, self._now(), options)
-        refused = rules.refusal(policy, candidate.answered, surveyed, options)
+        share = await self._surveyed_share(candidate, place, result, options)
+        is_outdated = await self._keeper.learn(candidate, place, share, policy, self._now(), options)
+        refused = rules.refusal(policy, candidate.answered, surveyed, share, options)
         if refused is None and is_outdated:
             refused = rules.Refusal.LITTLE_SURVEYED
         if refused is None and not has_its_camera(candidate.query, result):
@@ -164,7 +176,7 @@ class Adopter:
         if refused is None and surveyed is not None:
             refused = await self._refusal_by_pixels(candidate, place, surveyed, result, options)
         if refused is None and surveyed is not None:
-            refused = await self._adopt(candidate, place, surveyed, policy, options)
+            refused = await self._adopt(candidate, place, surveyed, share, policy, options)
         if surveyed is not None and rules.is_certain(policy, surveyed):
             await self._keeper.count_contradictions(candidate, place, surveyed, result, self._now(), options)
         return self._counted(scene_key, refused)
@@ -172,6 +184,27 @@ class Adopter:
     def _counted(self, scene_key: SceneKey, refused: Refusal | None) -> Refusal | None:
         self._observer.count_in_scene(scene_key, "adoptions", 1, "adopted" if refused is None else refused.value)
         return refused
+
+    async def _surveyed_share(
+        self, candidate: Candidate, place: Place, result: Result, options: AdoptionOptions
+    ) -> float:
+        """How much of what a photograph's answer explains the survey explains alone; `result` is as it is kept.
+
+        Asked with what its call stated of its camera: that a lens or a shutter is not as a reference needs it says
+        nothing of the place. An answer without adopted references shows that the survey is there, also where it needs
+        the call's priors or depth.
+        """
+        if candidate.by_survey:
+            return 1.0
+        if candidate.as_stated is not candidate.query:
+            result = await self._localizer.localized(
+                candidate.as_stated, place.surveyed_ids, candidate.query.photo.mask
+            )
+        if not isinstance(result.answer.outcome, Localization):
+            return 0.0
+        camera = candidate.query.photo.camera
+        size_px, surveyed_px = (camera.width_px, camera.height_px), inliers_px(result)
+        return await asyncio.to_thread(rules.surveyed_share, size_px, candidate.inliers_px, surveyed_px, options)
 
     async def _refusal_by_pixels(
         self, candidate: Candidate, place: Place, surveyed: Evidence, result: Result, options: AdoptionOptions
@@ -201,6 +234,7 @@ class Adopter:
         candidate: Candidate,
         place: Place,
         surveyed: Evidence,
+        share: float,
         policy: AdoptionPolicy,
         options: AdoptionOptions,
     ) -> Refusal | None:
@@ -209,7 +243,6 @@ class Adopter:
         (found,) = await self._engine.describe([photo], self._localizer.caller(scene_key), gives_way=True)
         vouchers = sorted(surveyed.inliers_of.items(), key=lambda it: -it[1])[:MOST_VOUCHERS]
         radii = surveyed.position_68_m, surveyed.position_95_m, surveyed.rotation_68_deg, surveyed.rotation_95_deg
-        share = rules.surveyed_share(candidate.answered, surveyed)
         vouching = tuple(Voucher(name, count) for name, count in vouchers)
         voucher_keys = [place.key_of[name] for name, _ in vouchers]
         new = NewReference(

@@ -6,6 +6,7 @@ import numpy as np
 
 from mapless.geometry import Array
 from mapless.names import parse_reference_name
+from mapless.provenance import ADOPTED
 from mapless.scenes import AdoptionPolicy
 from mapless_server.engine.group_cameras import read_with
 from mapless_server.engine.query import DEFAULT_REFERENCE_COUNT, Query, Result
@@ -82,6 +83,21 @@ def kept_query(query: Query, result: Result, policy: AdoptionPolicy, coverage: f
         return None
     error_m = camera_error_m(camera.camera, camera.sigma.focal_share, distance_shown(result))
     return read_with(kept, camera) if error_m <= policy.radius_m else None
+
+
+def with_stated_camera(kept: Query, query: Query) -> Query:
+    """A kept query with the uncertainty of the camera and the shutter that its call stated; itself without any."""
+    stated = replace(kept.options, intrinsics=query.options.intrinsics, shutter=query.options.shutter)
+    return kept if query.photo.exif is not None or stated == kept.options else replace(kept, options=stated)
+
+
+def is_by_survey(result: Result) -> bool:
+    """Whether no adopted reference has part in an answer."""
+    support = result.answer.support
+    if not isinstance(support, PosedSupport):
+        return False
+    counts = zip(support.references, support.inliers_by_reference(), strict=True)
+    return not any(count and it.provenance.source == ADOPTED for it, count in counts)
 
 
 def shares_compared(found: Evidence, result: Result) -> dict[str, float]:

@@ -126,20 +126,17 @@ class Keeper:
         self,
         candidate: Candidate,
         place: Place,
-        surveyed: Evidence | None,
+        share: float,
         policy: AdoptionPolicy,
         now: datetime,
         options: AdoptionOptions,
     ) -> bool:
         """Counts what a photograph says of the places around it, and of the adopted references at its own.
 
-        Returns whether its own is outdated.
+        `share` is that of `policy.surveyed_share`. Returns whether its own place is outdated.
         """
         database, answered, scene_key = self._store.database, candidate.answered, candidate.query.scene_key
         counted, now_us = set[str](), time_us(now)
-        if surveyed is None and answered.inliers_of.keys() <= set(place.surveyed_ids):
-            surveyed = answered  # with priors, depth or options of its call the survey alone sufficed
-        share = rules.surveyed_share(answered, surveyed)
 
         def learned(key: str, known: Standing) -> Standing:
             # Once outdated it stays so until a new survey: answers by what is left of the old one say nothing.

@@ -23,8 +23,10 @@ class Candidate:
     """An answered photograph that may become a reference.
 
     Attributes:
-        query: as it was asked.
+        query: as it is asked again, see `evidence.kept_query`.
+        as_stated: likewise, with what its call stated of its camera; else the same.
         answered: its answer.
+        by_survey: whether no adopted reference has part in that.
         inliers_px: (M, 2) the keypoints of the matches that agree with it, pixels of the photograph as it was sent.
         distance_m: median distance of what it shows; see `evidence.distance_shown`.
         holder: its caller, see `policy.holder_of`.
@@ -32,7 +34,9 @@ class Candidate:
     """
 
     query: Query
+    as_stated: Query
     answered: Evidence
+    by_survey: bool
     inliers_px: Array
     distance_m: float
     holder: str
