@@ -55,9 +55,9 @@ class Scene:
             do not agree with their poses; empty if it does not, or is not known to. Of `get_scene` alone.
         compared_pair_count: pairs of references that show enough in common to be compared with their poses.
         agreeing_pair_count: how many of these agree with them.
-        pending_work: what the server has still to make of its references in the background; of `get_scene` alone, as
-            the next two.
-        adopted_reference_count: number of adopted references that are in use.
+        pending_work: what the server has still to make of its references in the background; of `get_scene` alone.
+        adopted_reference_count: number of adopted references that are in use; None where it is not known, since only
+            `get_scene` asks for it, as for the next.
         retired_reference_count: number of references that are retired, surveyed and adopted ones.
     """
 
@@ -76,8 +76,8 @@ class Scene:
     compared_pair_count: int = 0
     agreeing_pair_count: int = 0
     pending_work: tuple[PendingWork, ...] = ()
-    adopted_reference_count: int = 0
-    retired_reference_count: int = 0
+    adopted_reference_count: int | None = None
+    retired_reference_count: int | None = None
 
 
 @dataclass(frozen=True)

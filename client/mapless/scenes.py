@@ -124,6 +124,8 @@ class AdoptionPolicy:
     min_surveyed_share: float = 0.3
 
     def __post_init__(self) -> None:
+        given = {name: value for name, value in vars(self).items() if (name, value) != ("max_radius_m", None)}
+        wire.set_numbers(pb.AdoptionPolicy(), given)  # TypeError names one of another type
         if not 1 <= self.most_per_place <= MOST_PER_PLACE:
             raise ValueError(f"most_per_place must be 1 to {MOST_PER_PLACE}, is {self.most_per_place}")
         if not 0 < self.min_trust <= 1:  # in a message, 0 is the default

@@ -87,19 +87,26 @@ def listed(values: Iterable[T], kind: type[T], field: str) -> Iterator[tuple[str
 
 
 def set_numbers(message: Any, values: Mapping[str, object], path: str = "") -> None:
-    """Sets numbers and truth values of a message; TypeError names the field of a value of another type."""
+    """Sets numbers and truth values of a message.
+
+    TypeError names the field of a value of another type, ValueError that of one that the field cannot hold.
+    """
     for name, value in values.items():
         _set_number(message, name, value, path)
 
 
 def _set_number(message: Any, name: str, value: object, path: str) -> None:
+    field = message.DESCRIPTOR.fields_by_name[name]
     try:
+        if isinstance(value, bool) and field.cpp_type != field.CPPTYPE_BOOL:
+            raise TypeError
         setattr(message, name, value)
     except TypeError:
-        field = message.DESCRIPTOR.fields_by_name[name]
         others = {field.CPPTYPE_DOUBLE: "a number", field.CPPTYPE_BOOL: "True or False"}
         wanted = others.get(field.cpp_type, "a whole number")
         raise TypeError(f"{joined(path, name)} must be {wanted}, is {value!r}") from None
+    except (ValueError, OverflowError):
+        raise ValueError(f"{joined(path, name)} is out of the field's range, is {value}") from None
 
 
 def set_time(timestamp: Any, time: datetime, field: str) -> None:

@@ -58,6 +58,9 @@ def test_adopted_references_are_shown_and_undone(run: Run, client: Client, scene
     assert "references  4 (1 adopted)\n" in run("scene", "get", scene)[1]
     found = json.loads(run("scene", "get", scene, "--json")[1])
     assert (found["adopted_reference_count"], found["retired_reference_count"]) == (1, 0)
+    for action in (("update", scene, "--adopt"), ("list",)):  # which do not count them
+        text = "".join(run("scene", *action, "--json")[1].split())
+        assert '"adopted_reference_count":null,"retired_reference_count":null' in text
     shown = run("reference", "show", scene, "new")[1]
     for said in ("adopted from a localized photograph, within 0.02 m (95 %)", "50 % of its matches", "r0 ", ", r1 "):
         assert said in shown

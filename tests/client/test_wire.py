@@ -3,12 +3,13 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import date
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mapless import Client, names, wire
+from mapless import AdoptionPolicy, Client, names, wire
 from mapless.geometry import MAX_COORDINATE_M, Camera, RigidTransform
 from mapless.groups import RigImage, SequenceFrame
 from mapless.priors import PositionPrior, Priors, set_priors
@@ -80,11 +81,34 @@ def changed(**values: Any) -> Camera:
         (lambda it: Client("localhost").add_reference("s", it), "a.jpg", "reference must be a NewReference, is str; "),
         (lambda it: Client("localhost").localize(b"x", CAMERA, it), None, "scene must be its id or name, is None"),
         (lambda it: Client("localhost").localize(b"x", CAMERA, "s", coverage=it), "3", "coverage must be a number, is"),
+        (
+            lambda it: Client("localhost").undo_adoption("s", it),
+            date(2027, 1, 1),
+            "since must be a datetime, is datetime.d",
+        ),
+        (
+            lambda it: Client("localhost").restore_references("s", since=it),
+            "2027-01-01",
+            "since must be a datetime, is str",
+        ),
+        (
+            lambda it: Client("localhost").get_scene_report("s", days_per_period=it),
+            1.5,
+            "days_per_period must be a whole",
+        ),
+        (lambda it: AdoptionPolicy(max_radius_m=it), "0.1", "max_radius_m must be a number, is '0.1'"),
+        (lambda it: AdoptionPolicy(most_per_place=it), True, "most_per_place must be a whole number, is True"),
+        (lambda it: AdoptionPolicy(min_surveyed_share=it), None, "min_surveyed_share must be a number, is None"),
     ],
 )
 def test_a_value_of_another_type_is_named(convert: Callable[[Any], Any], value: Any, error_text: str) -> None:
     with pytest.raises(TypeError, match=error_text):
         convert(value)
+
+
+def test_a_number_that_a_field_cannot_hold_is_named() -> None:
+    with pytest.raises(ValueError, match="days_per_period is out of the field's range, is 10000000"):
+        Client("localhost").get_scene_report("s", days_per_period=10**20)
 
 
 def test_an_unknown_side_of_a_read_out_is_named() -> None:

@@ -43,7 +43,7 @@ async def restore_references(
     """
     request = pb.RestoreReferencesRequest(scene=scene_name(scene), place=reference_name(scene, place) if place else "")
     if since is not None:
-        _check_zone(since)
+        _check_time(since)
         wire.set_time(request.since, since, "since")
     return await connection.call("RestoreReferences", request, _restored, timeout_s)
 
@@ -63,7 +63,8 @@ async def restore_reference(
     return await connection.call("RestoreReference", request, _reference, timeout_s)
 
 
-def _check_zone(since: datetime) -> None:
+def _check_time(since: datetime) -> None:
+    wire.require(since, datetime, "since", "such as datetime.now(timezone.utc)")
     if since.tzinfo is None:
         raise ValueError("since must have a time zone")
 
@@ -84,7 +85,7 @@ async def undo_adoption(
         since: the time, with time zone, by the server's clock.
         timeout_s: deadline of each call.
     """
-    _check_zone(since)
+    _check_time(since)
     adopted = [it async for it in list_references(connection, scene, only_adopted=True, timeout_s=timeout_s)]
     chosen = [it for it in adopted if (it.provenance.adopt_time or it.create_time) >= since]
     for it in chosen:

@@ -34,8 +34,8 @@ async def get_scene_report(
         scene=scene_name(scene),
         first_day=_text(first_day, "first_day"),
         last_day=_text(last_day, "last_day"),
-        days_per_period=days_per_period,
     )
+    wire.set_numbers(request, {"days_per_period": days_per_period})
     return await connection.call("GetSceneReport", request, _report, timeout_s)
 
 

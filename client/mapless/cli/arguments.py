@@ -58,7 +58,8 @@ def make_parser() -> argparse.ArgumentParser:
     )
     health.set_defaults(run=commands.health)
     _add_scene(groups.add_parser("scene", help="create, update, get, report, list, delete"))
-    _add_reference(groups.add_parser("reference", help="add, show, download, list, delete, restore"))
+    what = "add, show, download, list, delete, retire, restore, undo-adoption"
+    _add_reference(groups.add_parser("reference", help=what))
     add_localize(groups.add_parser("localize", help="localize a photograph, or a folder of them"))
     _add_questions(groups)
     completion = groups.add_parser(
