@@ -110,6 +110,26 @@ class TestOpening:
             assert not list(data_dir.glob("*.sqlite3-*"))  # else it is removed beneath whatever opens the folder next
             reading.result()
 
+    def test_a_closed_store_is_neither_read_nor_written(self, data_dir: Path) -> None:
+        store = Store.open(data_dir)
+        store.close()
+        database = store.database
+        for use in (database.check, database.free_space, database.read().__enter__, database.write().__enter__):
+            with pytest.raises(errors.Unavailable, match="closed"):
+                use()
+        assert not list(data_dir.glob("*.sqlite3-*"))
+
+    def test_threads_that_read_on_close_their_connection(self, data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(sqlite, "CLOSING_S", 0.01)
+        store = Store.open(data_dir)
+        with store.database.read() as connection:
+            driver_connection = connection.connection.driver_connection
+            store.close()
+            assert connection.exec_driver_sql("SELECT 1").scalar() == 1
+        assert driver_connection is not None
+        with pytest.raises(sqlite.choose_library().ProgrammingError, match="closed"):
+            driver_connection.execute("SELECT 1")
+
     def test_transactions_really_begin(self, store: Store, data_dir: Path) -> None:
         with store.database.write() as writer:
             assert writer.connection.driver_connection.in_transaction  # type: ignore[union-attr]

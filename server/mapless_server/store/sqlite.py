@@ -11,7 +11,6 @@ import importlib
 import logging
 import os
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum, auto
@@ -22,7 +21,6 @@ from urllib.parse import quote
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, select
 from sqlalchemy.exc import DBAPIError
-from sqlalchemy.pool import QueuePool
 
 from mapless_server.errors import FailedPrecondition, RequestError, Unavailable
 
@@ -44,11 +42,10 @@ FREE_SPACE_TIMEOUT_MS = 100
 JOURNAL_KEPT_BYTES = 8 * 2**20
 """A journal that a large change has made longer is truncated when it is restarted. Deleting needs less."""
 CLOSING_S = 10.0
-"""How long closing waits for threads that read or write; whatever reads for longer closes its connection itself."""
+"""How long closing waits for threads that read or write; one that takes longer closes its connection at its end."""
 SPACE_TO_OPEN_BYTES = 64 * 1024
 """Free space that SQLite needs beside the file to open it."""
 
-_POLL_S = 0.01
 _URI_PREFIX = "file:"
 _BEGIN_OPTION = "sqlite_begin_statement"
 
@@ -95,6 +92,7 @@ class SqliteDatabase:
         self._writing_engine = engine.execution_options(**{_BEGIN_OPTION: "BEGIN IMMEDIATE"})
         # SQLite's writers poll for its lock, in no order; here they queue.
         self._write_lock = threading.Lock()
+        self._use, self._use_count, self._closed = threading.Condition(), 0, threading.Event()
         self._folder_lock = folder_lock
         self._reserve: Reserve | None = None
         self.only_reads = only_reads
@@ -202,10 +200,8 @@ class SqliteDatabase:
             try:
                 with connection.begin():
                     found = migrate(connection)
-                    if (
-                        found not in (None, SCHEMA_VERSION)
-                        and connection.exec_driver_sql("PRAGMA foreign_key_check").first()
-                    ):
+                    is_changed = found not in (None, SCHEMA_VERSION)
+                    if is_changed and connection.exec_driver_sql("PRAGMA foreign_key_check").first():
                         raise ValueError("a part of it refers to what is not there")
             finally:
                 _execute(connection, "PRAGMA foreign_keys=ON")
@@ -214,7 +210,7 @@ class SqliteDatabase:
     def read(self) -> Iterator[Connection]:
         """Implements Database."""
         # Rolled back, as closing does: after a damaged page SQLite refuses to commit even an empty transaction.
-        with translating(_translated), self._engine.connect() as connection:
+        with translating(_translated), self._connected(self._engine) as connection:
             connection.begin()
             yield connection
 
@@ -223,8 +219,25 @@ class SqliteDatabase:
         """Implements Database."""
         if self.only_reads:
             raise FailedPrecondition("the store can only be read", reason="STORE_READ_ONLY")
-        with translating(_translated), self._write_lock, self._writing_engine.begin() as connection:
-            yield connection
+        with translating(_translated), self._write_lock, self._connected(self._writing_engine) as it, it.begin():
+            yield it
+
+    @contextmanager
+    def _connected(self, engine: Engine) -> Iterator[Connection]:
+        """A connection, which closing waits for; Unavailable once the database is being closed."""
+        with self._use:
+            if self._closed.is_set():
+                raise unavailable("the store is closed")
+            self._use_count += 1
+        try:
+            with engine.connect() as connection:
+                yield connection
+        finally:
+            with self._use:
+                self._use_count -= 1
+                self._use.notify_all()
+                if self._closed.is_set():
+                    engine.pool.dispose()
 
     def check(self) -> None:
         """Implements Database; a file that was removed is away, too, although SQLite goes on reading what it held."""
@@ -237,7 +250,7 @@ class SqliteDatabase:
         if not self._write_lock.acquire(blocking=False):
             return  # a change of our own is being written
         try:
-            with translating(_translated), self._writing_engine.connect() as connection:
+            with translating(_translated), self._connected(self._writing_engine) as connection:
                 _execute(connection, f"PRAGMA busy_timeout={CHECK_TIMEOUT_MS}")
                 try:
                     connection.begin().rollback()
@@ -252,7 +265,7 @@ class SqliteDatabase:
     def free_space(self) -> None:
         """Implements Database."""
         suppressed = suppress(self._engine.dialect.loaded_dbapi.Error)  # the journal then stays as it is
-        with translating(_translated), self._write_lock, self._engine.connect() as connection, suppressed:
+        with translating(_translated), self._write_lock, self._connected(self._engine) as connection, suppressed:
             # Writers wait while this waits for readers.
             _execute(connection, f"PRAGMA busy_timeout={FREE_SPACE_TIMEOUT_MS}")
             try:
@@ -272,27 +285,22 @@ class SqliteDatabase:
             self.free_space()
 
     def close(self) -> None:
-        """Closes all connections, once other threads have given back theirs, and unlocks the folder.
+        """Refuses further transactions, closes all connections once they are not used, and unlocks the folder.
 
-        A task of the server that is cancelled leaves its thread to end by itself. Were its connection closed after the
-        others, SQLite's journal would vanish beneath whatever opens the folder next.
+        A task of the server that is cancelled leaves its thread to end by itself. If its connection is closed after
+        the others, SQLite's journal vanishes beneath whatever opens the folder next: it is waited for `CLOSING_S`.
         """
-        pool = self._engine.pool
-        assert isinstance(pool, QueuePool)
-        end_s = time.monotonic() + CLOSING_S
-        while pool.checkedout() and time.monotonic() < end_s:
-            time.sleep(_POLL_S)
-        self._engine.dispose()
+        with self._use:
+            self._closed.set()
+            self._use.wait_for(lambda: not self._use_count, CLOSING_S)
+            self._engine.pool.dispose()
         if self._folder_lock is not None:
             self._folder_lock.release()
-            self._folder_lock = None
 
 
 def _execute(connection: Connection, statement: str) -> None:
     """Executes outside of any transaction."""
-    driver_connection = connection.connection.driver_connection
-    assert driver_connection is not None
-    driver_connection.execute(statement)
+    connection.connection.cursor().execute(statement)
 
 
 def _explain(error: DBAPIError, name: str) -> str:
