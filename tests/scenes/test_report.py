@@ -7,6 +7,7 @@ import pytest
 
 from mapless.geometry import Array, RigidTransform, rotation_from_vector
 from mapless_server.method.rejection import RejectionReason
+from mapless_server.scenes.report import renewal
 from mapless_server.scenes.report.counting import Places, Sighting, counted
 from mapless_server.scenes.report.renewal import added_days
 from mapless_server.scenes.report.summary import Cluster, Period, PlaceCounts, Recent, recent_of, suggestions
@@ -195,3 +196,22 @@ def test_a_reference_is_added_at_an_older_ones_place() -> None:
     surveyed = [Surveyed(key, (DAY + day) * DAY_US, pose) for key, (day, pose) in stored.items()]
     assert added_days(surveyed, DAY) == {"b": DAY + 8, "c": DAY + 9}
     assert added_days(surveyed[:2], DAY) == added_days([], DAY) == {}
+
+
+@pytest.mark.parametrize("most", [7, 30, 100])
+@pytest.mark.parametrize("first", [0, 5])
+def test_many_days_of_adding_are_as_one_by_one(monkeypatch: pytest.MonkeyPatch, most: int, first: int) -> None:
+    """Each of the last ones is at the nearest of days before that looks within 60 degrees, or else at the nearest."""
+    monkeypatch.setattr(renewal, "MOST_ADDED", most)
+    random = np.random.default_rng(most)
+    days = random.integers(0, 12, 60).tolist()  # about five a day
+    poses = [at(x, turned) for x, turned in random.uniform([-9, -180], [9, 180], (60, 2))]
+    surveyed = [Surveyed(f"r{i}", (DAY + days[i]) * DAY_US + 7, poses[i]) for i in range(60)]
+    expected, in_order = dict[str, int](), sorted(range(60), key=lambda it: days[it])
+    for i in in_order[-most:]:
+        before, axis = [it for it in in_order if days[it] < days[i]], poses[i].rotation[:, 2]
+        alike = [it for it in before if poses[it].rotation[:, 2] @ axis > 0.5] or before
+        if alike and days[i] >= first:
+            distances = [np.linalg.norm(poses[it].translation - poses[i].translation) for it in alike]
+            expected[surveyed[alike[int(np.argmin(distances))]].key] = DAY + days[i]
+    assert added_days(surveyed, DAY + first) == expected

@@ -67,6 +67,10 @@ class Held:
     def maintain(self) -> None:
         asyncio.run_coroutine_threadsafe(self.adopter.maintain(), self.loop).result(60)
 
+    def outdated(self) -> dict[str, str]:
+        with self.store.database.read() as connection:
+            return adoption.list_outdated(connection, ROOM)
+
     @property
     def adopted(self) -> list[str]:
         return [it.reference_id for it in self.client.list_references("room", only_adopted=True)]
@@ -382,16 +386,16 @@ def test_a_place_with_too_little_survey_left_is_named(held: Held) -> None:
     assert any("survey these places again" in it for it in held.client.get_scene("room").warnings)
     rejected = held.client.localize(_noise(), held.place.queries[0].camera, "room")
     assert isinstance(rejected, Rejected)
-    outdated = adoption.list_outdated(held.store.database, ROOM).values()
+    outdated = held.outdated().values()
     assert rejected.outdated_place.rpartition("/")[2] in outdated
     assert rejected.hint is not None
     assert rejected.outdated_place.rpartition("/")[2] in rejected.hint.message
     held.maintain()
-    assert list(adoption.list_outdated(held.store.database, ROOM).values()) == list(outdated)
+    assert list(held.outdated().values()) == list(outdated)
     here = held.place.references[1::2]
     held.client.add_references("room", [it.reference() for it in here])
     held.maintain()
-    assert adoption.list_outdated(held.store.database, ROOM) == {}
+    assert held.outdated() == {}
     assert not any("survey" in it for it in held.client.get_scene("room").warnings)
 
 

@@ -1,7 +1,10 @@
 """Reports of scenes through a server, of photographs that it has answered."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import date, datetime, timedelta, timezone
+from threading import Event
+from typing import Any
 
 import grpc
 import numpy as np
@@ -17,6 +20,7 @@ from mapless.v1.reference_service_pb2_grpc import ReferenceServiceStub
 from mapless_server.method.rejection import Advice, Hint, Rejection, RejectionReason
 from mapless_server.security import SceneKey
 from mapless_server.serve import counting
+from mapless_server.services import reports
 from mapless_server.store import adoption, counts
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums
 
@@ -86,6 +90,33 @@ def test_a_scene_made_again_has_no_counts(client: Client) -> None:
         client.localize(PHOTO, CAMERA, "again")
         assert reported(client, "again", 1).periods[-1].photograph_count == 1
         client.delete_scene("again")
+
+
+def test_a_server_makes_one_report_at_a_time(
+    client: Client, server: RunningServer, scene: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many ask, also where their callers have gone; other calls do not wait for them."""
+    make, running, most, goes_on = reports.scene_report, list[int](), list[int](), Event()
+
+    def counted(*asked: Any) -> pb.SceneReport:
+        running.append(1)
+        most.append(len(running))
+        goes_on.wait(10)
+        running.pop()
+        return make(*asked)
+
+    monkeypatch.setattr("mapless_server.services.references.scene_report", counted)
+    asked = pb.GetSceneReportRequest(scene=f"scenes/{scene}")
+    with grpc.insecure_channel(server.address) as channel, ThreadPoolExecutor(5) as pool:
+        stub = ReferenceServiceStub(channel)
+        gone = [stub.GetSceneReport.future(asked, timeout=0.2) for _ in range(5)]
+        assert {it.code() for it in gone} == {grpc.StatusCode.DEADLINE_EXCEEDED}
+        made = [pool.submit(client.get_scene_report, scene) for _ in range(5)]
+        assert client.get_scene(scene).scene_id == scene
+        goes_on.set()
+        assert all(it.result().scene_id == scene for it in made)
+    assert set(most) == {1}
+    assert 6 <= len(most) < 10
 
 
 def test_old_and_new_weeks_differ(client: Client, server: RunningServer, scene: str) -> None:

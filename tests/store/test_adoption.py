@@ -309,7 +309,7 @@ def test_restoring_ends_that_a_place_is_outdated(place: Place, by: str) -> None:
         assert restoring.restore(store, HALL, since=day).staying == {"new": "its place needs a new survey"}
         restored = restoring.restore(store, HALL, place_id="a" if by == "place" else "")
         assert restored == restoring.Restored(["new"], {})
-        assert adoption.list_outdated(store.database, HALL) == {}
+        assert adoption.list_outdated_scenes(store.database) == {}
 
 
 def test_what_nothing_vouches_for_stays_retired(place: Place) -> None:
@@ -361,7 +361,6 @@ def test_standings_are_counted_and_forgotten_when_restored(place: Place) -> None
             == {keys["a"]: Standing(2, 0, 0.25, 5, ("7:", "8:a"), ("7::25", "8:a:30"), 9)}
             == adoption.read_standings(store.database, keys.values())
         )
-        assert adoption.list_outdated(store.database, HALL) == {keys["a"]: "a"}
         assert adoption.list_outdated_scenes(store.database) == {HALL: {keys["a"]: 9}}
         adoption.retire(store, HALL, [keys["a"]], RetirementReason.CONTRADICTED)
         restoring.restore_reference(store, HALL, "a")

@@ -4,8 +4,9 @@ from datetime import date, timedelta
 
 import numpy as np
 import pytest
+from sqlalchemy import event
 from support.plain_reports import plain_period, plain_places, plain_rejected, plain_suggestions, stored_counts
-from support.stores import make_reference
+from support.stores import Place, make_reference
 
 from mapless.v1 import localization_service_pb2 as localization_pb
 from mapless.v1 import reference_service_pb2 as pb
@@ -14,7 +15,7 @@ from mapless_server.security import SceneKey
 from mapless_server.services import reports
 from mapless_server.services.messages.enums import enum_to_message
 from mapless_server.services.reports import scene_report
-from mapless_server.store import Store, counts
+from mapless_server.store import Store, adoption, counts
 from mapless_server.store.counts import LOCALIZED, CountKey, Sums, happening
 
 HALL = SceneKey("hall")
@@ -99,6 +100,70 @@ def test_a_report_is_its_plain_twin(store: Store, monkeypatch: pytest.MonkeyPatc
         assert suggested.distance_m == pytest.approx(distance_m)
         assert f"{rejected} of {count} photographs" in suggested.message
         assert f"most often {RejectionReason(reason).name} " in suggested.message
+
+
+def test_references_added_on_many_days_renew_their_places(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each place from its own day on; and the number of statements is that for one."""
+    monkeypatch.setattr("mapless_server.scenes.report.summary.MOST_SUGGESTIONS", 100)
+    store.create_scene(HALL)
+    records = {it.key: it for it in store.add_references(HALL, [make_reference(f"r{it}") for it in range(60)])}
+    random, keys, its = np.random.default_rng(3), list(records), dict[CountKey, Sums]()
+    for key in keys[:50]:
+        for day in random.choice(np.arange(FIRST, LAST + 1), 5, replace=False).tolist():
+            for outcome in OUTCOMES[:3]:
+                n, x = int(random.integers(1, 9)), float(random.normal())
+                its[CountKey(day, key, outcome)] = Sums(n, position_count=n, offset_x=x)
+    counts.add_counts(store.database, {HALL: its})
+    request, executed, statements = pb.GetSceneReportRequest(last_day=day_text(LAST)), list[str](), list[int]()
+    request.first_day = day_text(FIRST)
+    with store.database.read() as connection:
+        event.listen(connection.engine, "before_cursor_execute", lambda *its: executed.append(its[2]))
+    for places in (keys[:1], keys[10:]):  # the last ten have no photographs
+        added = {key: FIRST + i % 40 for i, key in enumerate(places)}
+        monkeypatch.setattr("mapless_server.scenes.report.renewal.added_days", lambda *_, it=added: it)
+        executed.clear()
+        report = scene_report(store, HALL, request)
+        statements.append(len(executed))
+        expected = plain_suggestions(plain_places(its, records), records, added, LAST)
+        found = {it.place.rpartition("/")[2]: it for it in report.suggestions}
+        assert found.keys() == {records[it].reference_id for it in expected}
+        for key, (rescued, rejected, count, _, distance_m) in expected.items():
+            suggested = found[records[key].reference_id]
+            assert (suggested.photograph_count, suggested.distance_m) == pytest.approx((rescued, distance_m))
+            assert f"{rejected} of {count} photographs" in suggested.message
+    assert statements[0] == statements[1] > 0
+
+
+def test_a_report_is_of_one_moment(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reference that is deleted while the report is made is in it, with its photographs, and not in the next one."""
+    store.create_scene(HALL)
+    (key,) = (it.key for it in store.add_references(HALL, [make_reference("a")]))
+    counts.add_counts(store.database, {HALL: {CountKey(LAST, key, "gate"): Sums(5)}})
+    adoption.change_standings(store.database, [key], lambda _, it: adoption.outdated(it))
+
+    def deleting(*_: object) -> dict[str, int]:
+        store.delete_reference(HALL, "a")
+        return {}
+
+    request = pb.GetSceneReportRequest(last_day=day_text(LAST))
+    with monkeypatch.context() as patch:
+        patch.setattr("mapless_server.scenes.report.renewal.added_days", deleting)
+        (place,) = scene_report(store, HALL, request).places
+    assert (place.reference, place.is_outdated) == ("scenes/hall/references/a", True)
+    (place,) = scene_report(store, HALL, request).places
+    assert (place.reference, place.is_outdated) == ("", False)
+
+
+def test_a_damaged_reference_is_no_outdated_place(store: Store, place: Place) -> None:
+    """Its photographs are counted where no place is known."""
+    store.create_scene(HALL)
+    (key,) = (it.key for it in store.add_references(HALL, [make_reference("a")]))
+    counts.add_counts(store.database, {HALL: {CountKey(LAST, key, "gate"): Sums(5)}})
+    adoption.change_standings(store.database, [key], lambda _, it: adoption.outdated(it))
+    place.execute("UPDATE reference SET geometry = ?", b"damaged")
+    (unknown,) = scene_report(store, HALL, pb.GetSceneReportRequest(last_day=day_text(LAST))).places
+    assert (unknown.reference, unknown.is_outdated) == ("", False)
+    assert unknown.periods[-1].rejections[0].count == 5
 
 
 def test_places_beyond_the_bound_are_counted(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,12 +43,14 @@ def _age(store: Store, scene: BusyScene) -> SceneAge | None:
     except (NotFound, DataLoss):
         return None
     least = AdoptionOptions().least_photographs
+    with store.database.read() as connection:
+        outdated = adoption.list_outdated(connection, scene.scene_key)
     return SceneAge(
         scene.scene_key,
         scene.photograph_count,
         scene.localized_count / scene.photograph_count,
         scene.localized_before / scene.photographs_before if scene.photographs_before else None,
         counts.least_surveyed_share(store.database, scene.scene_key, least) if adopts else None,
-        len(adoption.list_outdated(store.database, scene.scene_key)),
+        len(outdated),
         *counts.count_references(store.database, scene.scene_key),
     )

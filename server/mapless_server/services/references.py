@@ -77,10 +77,13 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         self._reach = Reach(store)
         self._adding = Adding(engine, store, self._stored, adopted_hours)
         self._threads = ThreadPoolExecutor(STORE_THREADS, thread_name_prefix="store")
+        # A report of a large scene takes seconds: one at a time, and none keeps another call from the store.
+        self._reporting = ThreadPoolExecutor(1, thread_name_prefix="report")
 
     def close(self) -> None:
         """Waits for running operations of the store."""
-        self._threads.shutdown(wait=True)
+        for threads in (self._threads, self._reporting):
+            threads.shutdown(wait=True)
 
     async def CreateScene(self, request: pb.CreateSceneRequest, call: Call) -> pb.CreateSceneResponse:
         """Implements ReferenceService.CreateScene."""
@@ -140,8 +143,8 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
         from mapless_server.store import adoption
         from mapless_server.store.reporting import find_references
 
-        outdated = adoption.list_outdated(self._store.database, key)
         with self._store.database.read() as connection:
+            outdated = adoption.list_outdated(connection, key)
             named = find_references(connection, key, list(outdated)[:MOST_NAMED])
         places = [named_place(name, named.get(it)) for it, name in outdated.items()]
         return dict.fromkeys([outdated_places(places)] if places else [])
@@ -328,7 +331,9 @@ class ReferenceService(rpcs.ReferenceServiceServicer):
     async def GetSceneReport(self, request: pb.GetSceneReportRequest, call: Call) -> pb.GetSceneReportResponse:
         """Implements ReferenceService.GetSceneReport."""
         scene_key = await self._reach.scene_key(call, request.scene, "scene")
-        return pb.GetSceneReportResponse(report=await self._stored(scene_report, self._store, scene_key, request))
+        loop = asyncio.get_running_loop()
+        report = await loop.run_in_executor(self._reporting, scene_report, self._store, scene_key, request)
+        return pb.GetSceneReportResponse(report=report)
 
     async def CheckCoverage(self, request: pb.CheckCoverageRequest, call: Call) -> pb.CheckCoverageResponse:
         """Implements ReferenceService.CheckCoverage."""

@@ -41,15 +41,15 @@ def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRe
     from mapless_server.store.surveys import list_surveyed
 
     days = days_from_message(request, datetime.now(timezone.utc).date())
-    scene, scene_id = store.get_scene(scene_key), scene_id_of(scene_key)
-    outdated = list_outdated(store.database, scene_key)
-    added = added_days(list_surveyed(store.database, scene_key, days.first * DAY_US), days.first)
-    message = pb.SceneReport(scene=names.scene_name(scene_id), arbitrary_unit=scene.attributes.arbitrary_unit)
-    of_scene = summary.PlaceCounts()
+    scene_id, of_scene = scene_id_of(scene_key), summary.PlaceCounts()
+    message = pb.SceneReport(scene=names.scene_name(scene_id))
     with read_report(store.database, scene_key, days, summary.HALF_LIFE_DAYS) as stored:
+        scene, outdated = stored.scene(), list_outdated(stored.connection, scene_key)
+        added = added_days(list_surveyed(stored.connection, scene_key, days.first * DAY_US), days.first)
         (events, adopted), happened, counted = stored.events(MOST_EVENTS), stored.happened(), stored.places()
         keys = {*counted, *outdated, *(it.place_key for it in events)}
         records = find_references(stored.connection, scene_key, keys)
+        outdated = {key: it for key, it in outdated.items() if key in records}  # others are damaged
         found = stored.rejected()
         recent, rejected = summary.recent_of(found), summary.rejected_of(found, records)
         places = list(dict.fromkeys([*outdated, *summary.in_order(counted, records, rejected)]))
@@ -69,7 +69,7 @@ def scene_report(store: Store, scene_key: SceneKey, request: pb.GetSceneReportRe
         its_period = period_to_message(of_scene.period(age, days))
         message.periods.append(with_happened(its_period, happened.get(age, {})))
     message.first_day, message.last_day = message.periods[0].first_day, message.periods[-1].last_day
-    message.omitted_place_count = len(places) - len(of_place)
+    message.omitted_place_count, message.arbitrary_unit = len(places) - len(of_place), scene.attributes.arbitrary_unit
     for it in summary.suggestions(recent, {key: record.world_from_camera for key, record in records.items()}):
         at, unit = records[it.place_key], scene.attributes.unit
         message.suggestions.append(suggestion_to_message(it, at, unit, it.place_key in outdated))

@@ -212,7 +212,7 @@ def read_standings(database: Database, keys: Collection[str]) -> dict[str, Stand
         return {it.reference_key: rows.standing(it) for it in found}
 
 
-def list_outdated(database: Database, scene_key: SceneKey) -> dict[str, str]:
+def list_outdated(connection: Connection, scene_key: SceneKey) -> dict[str, str]:
     """Ids of the references whose places need a new survey, by key, ordered by id; empty if there is no such scene."""
     statement: Select[Any] = (
         select(reference.c.key, reference.c.reference_id)
@@ -220,8 +220,7 @@ def list_outdated(database: Database, scene_key: SceneKey) -> dict[str, str]:
         .where(reference.c.scene_id == scene_key, reference_standing.c.outdate_time_us.is_not(None))
         .order_by(reference.c.reference_id)
     )
-    with database.read() as connection:
-        return {it.key: it.reference_id for it in connection.execute(statement)}
+    return {it.key: it.reference_id for it in connection.execute(statement)}
 
 
 def list_outdated_scenes(database: Database) -> dict[SceneKey, dict[str, int]]:

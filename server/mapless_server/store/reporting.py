@@ -6,12 +6,12 @@ A year of a scene with a thousand places has a million counts, so rows are read 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from sqlalchemy import ColumnElement, Connection, Double, Select, cast, func, select
+from sqlalchemy import ColumnElement, Connection, Double, FromClause, Select, cast, column, func, select, values
 
 from mapless_server.errors import DataLoss
 from mapless_server.security import SceneKey
@@ -19,7 +19,7 @@ from mapless_server.security import SceneKey
 from . import queries, rows
 from .counts import DAY_US, HAPPENED, LOCALIZED, Sums
 from .database import Database
-from .records import ReferenceRecord
+from .records import ReferenceRecord, SceneRecord
 from .tables import adopted_reference, reference, reference_standing, scene_count
 
 _ROWS_AT_A_TIME = 2000
@@ -140,6 +140,10 @@ class ReportReader:
         self._is_counted = (counted.scene_id == scene_key) & counted.day.between(days.first, days.last)
         self._is_answer = ~counted.outcome.contains(HAPPENED)
 
+    def scene(self) -> SceneRecord:
+        """The scene; NotFound if there is no such scene; DataLoss if its attributes are damaged."""
+        return queries.read_scenes(self.connection, [queries.find_scene(self.connection, self._scene_key)])[0]
+
     def places(self) -> list[str]:
         """Keys of all places of which photographs were counted, in no order; empty for those whose is not known."""
         found = select(scene_count.c.place_key).where(self._is_counted, self._is_answer).distinct()
@@ -160,23 +164,31 @@ class ReportReader:
 
     def rejected(self) -> list[OutcomeSums]:
         """Sums over rejected photographs by place and outcome."""
-        return self._by_outcome(scene_count.c.outcome != LOCALIZED)
+        return self._by_outcome(scene_count, scene_count.c.outcome != LOCALIZED)
 
-    def since(self, day: int, place_keys: Collection[str]) -> list[OutcomeSums]:
-        """Sums over all photographs of some places, by place and outcome, of the days after one."""
+    def since(self, days: Mapping[str, int]) -> list[OutcomeSums]:
+        """Sums over all photographs of places, by place and outcome, of the days after that of the place, by key.
+
+        One statement, with two parameters for each place, reads each count once: there may be a thousand places.
+        """
+        if not days:
+            return []
         counted = scene_count.c
-        found = list[OutcomeSums]()
-        for some in queries.portions(sorted(place_keys)):
-            found += self._by_outcome(counted.day > day, counted.place_key.in_(some))
-        return found
+        columns = column("place_key", counted.place_key.type), column("day", counted.day.type)
+        given = values(*columns, name="given").data(list(days.items())).cte("given").c
+        # SQLite makes an index of rows that are distinct and have types; others it reads once for each count.
+        after = select(cast(given.place_key, counted.place_key.type), given.day).distinct().subquery()
+        joined = scene_count.outerjoin(after, after.c.place_key == counted.place_key)
+        return self._by_outcome(joined, counted.day > func.coalesce(after.c.day, self._days.last))
 
-    def _by_outcome(self, *are_wanted: ColumnElement[bool]) -> list[OutcomeSums]:
+    def _by_outcome(self, source: FromClause, is_wanted: ColumnElement[bool]) -> list[OutcomeSums]:
         counted, names, count = scene_count.c, (*_POSITIONED, "squared_offset"), len(_POSITIONED)
         sums = [_sum(counted[name]) for name in names]
         weighted = [_sum(counted[name] * self._weight) for name in _POSITIONED]
         found: Select[Any] = (
             select(counted.place_key, counted.outcome, *sums, *weighted)
-            .where(self._is_counted, self._is_answer, *are_wanted)
+            .select_from(source)
+            .where(self._is_counted, self._is_answer, is_wanted)
             .group_by(counted.place_key, counted.outcome)
         )
         return [

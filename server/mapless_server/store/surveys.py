@@ -2,13 +2,12 @@
 
 from typing import Any, NamedTuple
 
-from sqlalchemy import Row, Select, select
+from sqlalchemy import Connection, Row, Select, select
 
 from mapless.geometry import RigidTransform
 from mapless_server.security import SceneKey
 
 from . import codec, queries
-from .database import Database
 from .tables import adopted_reference, reference
 
 
@@ -20,7 +19,7 @@ class Surveyed(NamedTuple):
     world_from_camera: RigidTransform
 
 
-def list_surveyed(database: Database, scene_key: SceneKey, since_us: int) -> list[Surveyed]:
+def list_surveyed(connection: Connection, scene_key: SceneKey, since_us: int) -> list[Surveyed]:
     """All surveyed references in use of a scene, if one of them was stored since a time; else none."""
     column = reference.c
     its: Select[Any] = select(column.key, column.create_time_us, column.geometry, column.geometry_sha256).where(
@@ -28,10 +27,9 @@ def list_surveyed(database: Database, scene_key: SceneKey, since_us: int) -> lis
         column.key.not_in(select(adopted_reference.c.reference_key)),
         ~queries.is_retired(column.key),
     )
-    with database.read() as connection:
-        if connection.execute(its.where(column.create_time_us >= since_us).limit(1)).first() is None:
-            return []
-        found = connection.execute(its).all()
+    if connection.execute(its.where(column.create_time_us >= since_us).limit(1)).first() is None:
+        return []
+    found = connection.execute(its).all()
     intact = [it for it in found if _is_intact(it)]
     poses = codec.decode_poses([it.geometry for it in intact])
     return [Surveyed(it.key, it.create_time_us, pose) for it, pose in zip(intact, poses, strict=True)]

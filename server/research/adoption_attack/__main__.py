@@ -152,7 +152,8 @@ async def measure(
             shifts, lost, gained, off_m = compared(before, await answers(server, views))
             adopted = [it async for it in server.client.list_references(SCENE, only_adopted=True)]
             retired = [it async for it in server.client.list_references(SCENE, only_retired=True)]
-            outdated = len(adoption.list_outdated(server.store.database, SceneKey(SCENE)))
+            with server.store.database.read() as connection:
+                outdated = len(adoption.list_outdated(connection, SceneKey(SCENE)))
             true = {adopted_id(it.path.read_bytes()): it.world_from_camera for it in photographs}
             off = tuple(
                 pose_error(true[it.reference_id], it.world_from_camera)[0] for it in adopted if it.reference_id in true

@@ -1,7 +1,7 @@
 """Leaves out of the counts of places what was counted before a reference was added there."""
 
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -22,38 +22,44 @@ def added_days(surveyed: Sequence[Surveyed], first_day: int) -> dict[str, int]:
     One that is added belongs to the place where it stands by the references of days before: so references that are
     stored on one day, as of a first survey, renew none of each other. Days before the first one are left out.
     """
-    if not surveyed:
+    its = sorted(surveyed, key=lambda it: it.create_time_us // DAY_US)
+    days = np.array([it.create_time_us // DAY_US for it in its])
+    start = max(len(its) - MOST_ADDED, int(np.searchsorted(days, first_day)))
+    if start == len(its):
         return {}
-    days = np.array([it.create_time_us // DAY_US for it in surveyed])
-    centres = np.stack([it.world_from_camera.translation for it in surveyed])
-    axes = np.stack([it.world_from_camera.rotation[:, 2] for it in surveyed])
-    found = dict[str, int]()
-    last = np.argsort(-days, kind="stable")[:MOST_ADDED]
-    for day in sorted({*days[last].tolist()}, reverse=True):
-        before = np.flatnonzero(days < day)
-        if day < first_day or not len(before):
-            break
-        viewpoints = Viewpoints(centres[before], axes[before])
-        for i in last[days[last] == day].tolist():
-            found.setdefault(surveyed[before[viewpoints.place(centres[i], axes[i])]].key, day)
+    centres = np.stack([it.world_from_camera.translation for it in its])
+    axes = np.stack([it.world_from_camera.rotation[:, 2] for it in its])
+
+    def viewpoints(first: int, end: int) -> Viewpoints:
+        return Viewpoints(centres[first:end], axes[first:end])
+
+    found, trees, split = dict[str, int](), dict[int, Viewpoints](), 0
+    firsts = np.searchsorted(days, np.unique(days[start:])).tolist()
+    for i, (first, end) in enumerate(pairwise([*firsts, len(its)])):
+        if not first:
+            continue
+        # Two trees, by the index of their first reference: one of all for each of 365 days takes 15 s at 100,000.
+        # The first of these days is with the older ones as soon as it is past: it may be that of the first survey.
+        split = first if i < 2 else split
+        trees = {0: viewpoints(0, first)} if i < 2 else {0: trees[0], split: viewpoints(split, first)}
+        for row in range(max(start, first), end):
+            near = [at + tree.place(centres[row], axes[row]) for at, tree in trees.items()]
+            nearest = Viewpoints(centres[near], axes[near]).place(centres[row], axes[row])
+            found[its[near[nearest]].key] = int(days[row])
     return found
 
 
 def since_added(
     recent: Mapping[str, Recent],
     added: Mapping[str, int],
-    since: Callable[[int, Collection[str]], Iterable[OutcomeSums]],
+    since: Callable[[Mapping[str, int]], Iterable[OutcomeSums]],
 ) -> dict[str, Recent]:
     """Photographs of places after the last day on which a reference was added there, if one was.
 
     Args:
         recent: all photographs, by the key of their place.
         added: that day, by the key of the place.
-        since: reads the photographs of some places of the days after one.
+        since: reads the photographs of some places, each of the days after its own, by the key of the place.
     """
-    found, places = {key: its for key, its in recent.items() if key not in added}, defaultdict[int, list[str]](list)
-    for key, day in added.items():
-        places[day].append(key)
-    for day, keys in places.items():
-        found |= recent_of(since(day, keys))
-    return found
+    kept = {key: its for key, its in recent.items() if key not in added}
+    return kept | recent_of(since({key: added[key] for key in recent if key in added}))
