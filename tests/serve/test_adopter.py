@@ -312,6 +312,19 @@ def test_a_place_without_its_surveyed_reference_is_another(held: Held) -> None:
     assert held.client.get_reference("room", name).place_reference not in ("", place)
 
 
+def test_one_that_comes_to_an_outdated_place_retires(held: Held) -> None:
+    assert held.consider(held.candidate(held.place.queries[0])) is None
+    (name,) = held.adopted
+    held.client.delete_reference("room", held.client.get_reference("room", name).place_reference)
+    surveyed = {it.reference_id for it in held.client.list_references("room")} - {name}
+    keys = held.store.find_keys(ROOM, sorted(surveyed)).values()
+    adoption.change_standings(held.store.database, keys, lambda _, it: adoption.outdated(it))
+    held.maintain()
+    retired = held.store.list_retirements(ROOM, [name])
+    assert [it.reason for it in retired.values()] == [RetirementReason.SURVEY_OUTDATED]
+    assert held.client.get_reference("room", name).place_reference in surveyed
+
+
 def test_what_was_adopted_is_deleted_by_its_age(held: Held) -> None:
     assert held.consider(held.candidate(held.place.queries[0])) is None
     held.maintain()

@@ -215,10 +215,12 @@ def test_all_references_of_a_page_may_be_retired(client: Client, server: Running
 def test_an_adopted_reference_shows_its_place(client: Client, server: RunningServer, adopting: str) -> None:
     new = client.add_reference(adopting, NewReference("new", PHOTO, CAMERA, pose(5.0), provenance=ADOPTED))
     assert (new.place_reference, new.place) == ("", None)
-    database, state = store_of(server).database, PlaceState(0.4, 5, 0)
+    store, state = store_of(server), PlaceState(0.4, 5, 0)
     keys = {it: key_of(server, adopting, it) for it in ("new", "r1")}
-    adoption.set_places(database, {keys["new"]: keys["r1"]})
-    adoption.change_standings(database, [keys["r1"]], lambda _, it: replace(it, surveyed_share=0.4, photograph_count=5))
+    adoption.set_places(store, SceneKey(adopting), {keys["new"]: keys["r1"]})
+    adoption.change_standings(
+        store.database, [keys["r1"]], lambda _, it: replace(it, surveyed_share=0.4, photograph_count=5)
+    )
     found = {it.reference_id: it for it in client.list_references(adopting)}
     assert (found["new"].place_reference, found["new"].place) == ("r1", state)
     assert (found["r1"].place_reference, found["r1"].place) == ("", state)

@@ -13,6 +13,7 @@ from support.stores import Place, make_reference
 from mapless import AdoptionPolicy, Provenance, Voucher
 from mapless_server.errors import AlreadyExists, FailedPrecondition, NotFound
 from mapless_server.scenes.adoption.policy import AdoptionOptions, with_usefulness
+from mapless_server.security import SceneKey
 from mapless_server.store import RetirementReason, Store, adoption, queries, restoring
 from mapless_server.store.pairs import PairStore, Progress
 from mapless_server.store.portions import IndexReader
@@ -334,8 +335,46 @@ def test_restoring_keeps_to_the_most_of_a_place(place: Place) -> None:
         restored = restoring.restore(store, HALL)  # two is the most
         assert restored.reference_ids == ["old-2"]
         assert list(restored.staying) == ["old-0", "old-1"]
-        assert set(restored.staying.values()) == {"its place has 2 adopted references, as many as it may"}
+        assert set(restored.staying.values()) == {"its place has as many adopted references as it may"}
         assert len(adopt(store, adopted("newer", 0.9), 2)[1]) == 1
+
+
+def _moved(store: Store) -> tuple[dict[str, str], dict[str, RetirementReason]]:
+    """Keys by id, and why references retire: three of a deleted place b come to a place that has one."""
+    keys = hall(store)
+    vouchers = (Voucher("a", 40),)
+    for name, useful, here in (("at a", 0.25, "a"), ("b1", 0.1, "b"), ("b2", 0.2, "b"), ("b3", 0.3, "b")):
+        keys[name] = adopt(store, replace(adopted(name, useful, vouchers), place_key=keys[here]))[0].key
+    adoption.retire(store, HALL, [keys["b1"]], RetirementReason.BY_OPERATOR)
+    store.delete_reference(HALL, "b")
+    unplaced = adoption.list_unplaced(store.database, HALL)
+    assert unplaced == sorted(keys[it] for it in ("b1", "b2", "b3"))
+    return keys, adoption.set_places(store, HALL, dict.fromkeys(unplaced, keys["a"]))
+
+
+def test_a_place_that_gets_others_keeps_the_most_useful(place: Place) -> None:
+    with place.open() as store:
+        keys, reasons = _moved(store)  # two is the most; what is retired already takes no room
+        assert reasons == {keys["b2"]: RetirementReason.PLACE_FULL}
+        assert indexed(store) == ["a", "at a", "b3"]
+        assert adoption.list_unplaced(store.database, HALL) == []
+        store.delete_reference(HALL, "at a")
+        assert restoring.restore(store, HALL).reference_ids == ["b2"]
+
+
+def test_moved_to_an_outdated_place_a_reference_retires(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    with place.open() as store:
+        delete = store.delete_reference
+
+        def outdated(scene_key: SceneKey, reference_id: str) -> str:
+            at_a = store.find_keys(HALL, ["a"]).values()
+            adoption.change_standings(store.database, at_a, lambda _, it: adoption.outdated(it))
+            return delete(scene_key, reference_id)
+
+        monkeypatch.setattr(store, "delete_reference", outdated)
+        keys, reasons = _moved(store)
+        assert reasons == {keys[it]: RetirementReason.SURVEY_OUTDATED for it in ("at a", "b2", "b3")}
+        assert indexed(store) == ["a"]
 
 
 def test_standings_are_counted_and_forgotten_when_restored(place: Place) -> None:

@@ -77,7 +77,7 @@ COUNTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "retirements": (
         "References that were retired, so that they are not chosen any more.",
         "reason",
-        ("contradicted", "survey_outdated", "vouchers_gone"),
+        ("contradicted", "survey_outdated", "vouchers_gone", "place_full"),
     ),
     "adopted_expired": ("Adopted references that were deleted because of their age.", *_ALONE),
     "scene_counts_dropped": ("What reports of scenes lack: the store was away, or it could not be counted.", *_ALONE),

@@ -188,12 +188,38 @@ def list_unplaced(database: Database, scene_key: SceneKey) -> list[str]:
         return list(connection.scalars(statement.order_by(key)))
 
 
-def set_places(database: Database, places: Mapping[str, str]) -> None:
-    """Stores the key of the surveyed reference whose place each adopted one is at, by key."""
-    with database.write() as connection:
+def set_places(store: Store, scene_key: SceneKey, places: Mapping[str, str]) -> dict[str, RetirementReason]:
+    """Stores the key of the surveyed reference whose place each adopted one is at, by key, as one change of the scene.
+
+    Retires those at places that need a new survey, and the least useful of these places beyond the policy's most.
+
+    Returns:
+        Why references were retired, by key, also those that were there before.
+
+    NotFound if there is no such scene; references that are gone are passed over.
+    """
+    adopted = adopted_reference.c
+    with store.changing() as connection:
+        generation = changes.begin_change(connection, scene_key)
         for key, place_key in sorted(places.items()):
-            row = update(adopted_reference).where(adopted_reference.c.reference_key == key)
+            row = update(adopted_reference).where(adopted.reference_key == key)
             connection.execute(row.values(place_key=place_key))
+        in_use: Select[Any] = (
+            select(adopted_reference)
+            .join(reference, reference.c.key == adopted.reference_key)
+            .where(reference.c.scene_id == scene_key, ~queries.is_retired(reference.c.key))
+        )
+        its, standing = list[Row[Any]](), reference_standing.c
+        for some in queries.portions(sorted(set(places.values()))):
+            # Who declares one outdated waits for the end of the transaction, and then retires what is at it.
+            known = select(standing.reference_key).where(standing.reference_key.in_(some))
+            connection.execute(known.order_by(standing.reference_key).with_for_update(read=True)).all()
+            its += connection.execute(in_use.where(adopted.place_key.in_(some)))
+        reasons = restoring.without_room(connection, scene_key, its)
+        for reason in sorted(set(reasons.values())):
+            leaving = sorted(key for key, why in reasons.items() if why is reason)
+            retiring.retire(connection, scene_key, generation, leaving, reason)
+    return reasons
 
 
 def set_usefulness(database: Database, usefulness: Mapping[str, float]) -> None:

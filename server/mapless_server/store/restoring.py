@@ -12,19 +12,25 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, delete, func, select, update
+from sqlalchemy import Connection, Row, Select, delete, select, update
 
 from mapless.names import shown
 from mapless_server.errors import DataLoss, FailedPrecondition, InvalidArgument
 from mapless_server.security import SceneKey
 
 from . import changes, queries, retiring, rows
-from .records import ReferenceRecord
+from .records import ReferenceRecord, RetirementReason
 from .store import Store
 from .tables import adopted_reference, reference, reference_standing, removed_reference, scene
 
 MOST_LOST_SHARE = 0.5
 """Share of the vouching matches of an adopted reference whose references may be gone."""
+
+_STAYS_BECAUSE = {
+    RetirementReason.VOUCHERS_GONE: "what vouches for it was deleted or is retired",
+    RetirementReason.SURVEY_OUTDATED: "its place needs a new survey",
+    RetirementReason.PLACE_FULL: "its place has as many adopted references as it may",
+}
 
 
 @dataclass(frozen=True)
@@ -103,34 +109,41 @@ def _restore_lasting(
     ]
     _restore(connection, scene_key, generation, sorted({*keys} - {it.reference_key for it in its}))
     lost = lost_shares(connection, scene_key, [it.reference_key for it in its])
-    standing = reference_standing.c
-    is_here = reference.c.scene_id == scene_key
-    outdated = set(
-        connection.scalars(
-            select(reference.c.key)
-            .join(reference_standing, standing.reference_key == reference.c.key)
-            .where(is_here, standing.outdate_time_us.is_not(None))
+    reasons = {key: RetirementReason.VOUCHERS_GONE for key, share in lost.items() if share > MOST_LOST_SHARE}
+    reasons |= without_room(connection, scene_key, [it for it in its if it.reference_key not in reasons])
+    _restore(connection, scene_key, generation, sorted({it.reference_key for it in its} - reasons.keys()))
+    return {key: _STAYS_BECAUSE[reason] for key, reason in reasons.items()}
+
+
+def without_room(connection: Connection, scene_key: SceneKey, its: Sequence[Row[Any]]) -> dict[str, RetirementReason]:
+    """Why adopted references, rows of `adopted_reference`, cannot be in use at their places, by key; of some of them.
+
+    Their places need a new survey, or have no room for them beside others that are in use: the most useful have it,
+    and of equally useful ones the newest. The caller's transaction is a change of the scene.
+    """
+    adopted, standing = adopted_reference.c, reference_standing.c
+    keys, outdated, counts = {it.reference_key for it in its}, set[str](), Counter[str]()
+    for some in queries.portions(sorted({it.place_key for it in its})):
+        found = select(standing.reference_key).where(
+            standing.reference_key.in_(some), standing.outdate_time_us.is_not(None)
         )
-    )
-    used: Select[Any] = (
-        select(adopted.place_key, func.count())
-        .join(reference, adopted.reference_key == reference.c.key)
-        .where(is_here, ~queries.is_retired(reference.c.key))
-        .group_by(adopted.place_key)
-    )
-    counts = Counter({it.place_key: int(it[1]) for it in connection.execute(used)})
-    policy, staying = rows.scene_attributes(queries.find_scene(connection, scene_key)).adoption, dict[str, str]()
+        outdated |= set(connection.scalars(found))
+        used: Select[Any] = (
+            select(adopted.reference_key, adopted.place_key)
+            .join(reference, adopted.reference_key == reference.c.key)
+            .where(reference.c.scene_id == scene_key, adopted.place_key.in_(some), ~queries.is_retired(reference.c.key))
+        )
+        counts.update(it.place_key for it in connection.execute(used) if it.reference_key not in keys)
+    policy = rows.scene_attributes(queries.find_scene(connection, scene_key)).adoption
+    reasons = dict[str, RetirementReason]()
     for it in sorted(its, key=lambda row: (-row.usefulness, -row.adopt_time_us, row.reference_key)):
-        if lost.get(it.reference_key, 0.0) > MOST_LOST_SHARE:
-            staying[it.reference_key] = "what vouches for it was deleted or is retired"
-        elif it.place_key in outdated:
-            staying[it.reference_key] = "its place needs a new survey"
+        if it.place_key in outdated:
+            reasons[it.reference_key] = RetirementReason.SURVEY_OUTDATED
         elif policy is not None and counts[it.place_key] >= policy.most_per_place:
-            staying[it.reference_key] = f"its place has {policy.most_per_place} adopted references, as many as it may"
+            reasons[it.reference_key] = RetirementReason.PLACE_FULL
         else:
             counts[it.place_key] += 1
-    _restore(connection, scene_key, generation, sorted({it.reference_key for it in its} - staying.keys()))
-    return staying
+    return reasons
 
 
 def lost_shares(connection: Connection, scene_key: SceneKey, keys: Sequence[str]) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-import math
+from collections import Counter
 from collections.abc import Awaitable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
@@ -62,12 +62,13 @@ class Keeper:
     async def maintain(self, now: datetime, options: AdoptionOptions) -> None:
         """Deletes adopted references that are too old, and retires those whose vouching references are gone.
 
-        Those whose place is not known get one, and places that were surveyed again are not outdated any more. What
-        fails for a reference or a scene is logged and counted, and ends nothing.
+        Those whose place is not known get one, and those that this has no room for are retired. Places that were
+        surveyed again are not outdated any more. What fails for a reference or a scene is logged and counted, and ends
+        nothing.
         """
         before = now - timedelta(hours=self._hours)
         await self._guarded(self._delete_expired(before), "adopted references are not looked up by their age")
-        await self._guarded(self._look_after(options), "adopted references are not looked up by scene")
+        await self._guarded(self._look_after(), "adopted references are not looked up by scene")
         await self._guarded(self._end_all_outdated(options), "places that need a new survey are not looked up")
 
     def _guarded(self, work: Awaitable[object], fault: str) -> Awaitable[bool]:
@@ -79,32 +80,35 @@ class Keeper:
             if await self._guarded(deletion, f"{reference_id} of scene {scene_key}, which is too old, is not deleted"):
                 self._observer.count("adopted_expired")
 
-    async def _look_after(self, options: AdoptionOptions) -> None:
+    async def _look_after(self) -> None:
         scenes = await asyncio.to_thread(adoption.list_adopting_scenes, self._store.database)
         for scene_key, generation in scenes.items():
             if self._checked.get(scene_key) == generation:
                 continue
             fault = f"adopted references of scene {scene_key} are not looked up"
-            if await self._guarded(self._look_after_scene(scene_key, options), fault):
+            if await self._guarded(self._look_after_scene(scene_key), fault):
                 self._checked[scene_key] = generation
         self._checked = {it: generation for it, generation in self._checked.items() if it in scenes}
 
-    async def _look_after_scene(self, scene_key: SceneKey, options: AdoptionOptions) -> None:
+    async def _look_after_scene(self, scene_key: SceneKey) -> None:
         gone = await asyncio.to_thread(adoption.unvouched, self._store.database, scene_key)
         await self._retire(scene_key, gone, RetirementReason.VOUCHERS_GONE)
         if unplaced := await asyncio.to_thread(adoption.list_unplaced, self._store.database, scene_key):
-            await asyncio.to_thread(self._find_places, scene_key, unplaced, options)
+            await asyncio.to_thread(self._find_places, scene_key, unplaced)
 
-    def _find_places(self, scene_key: SceneKey, keys: Sequence[str], options: AdoptionOptions) -> None:
-        """Gives adopted references whose place is not known that of the surveyed reference that is nearest now."""
-        database, places = self._store.database, dict[str, str]()
-        with database.read() as connection:
+    def _find_places(self, scene_key: SceneKey, keys: Sequence[str]) -> None:
+        """Gives adopted references whose place is not known that of the surveyed reference that is nearest now.
+
+        Those that it has no room for are retired.
+        """
+        with self._store.database.read() as connection:
             records = find_references(connection, scene_key, keys)
-        for key, record in records.items():
-            place = self._localizer.place(scene_key, record.world_from_camera, math.inf, options)
-            if place is not None:
-                places[key] = place.key
-        adoption.set_places(database, places)
+        places = self._localizer.place_keys(scene_key, {key: it.world_from_camera for key, it in records.items()})
+        if not places:
+            return
+        retired = adoption.set_places(self._store, scene_key, places)
+        for reason, count in Counter(retired.values()).items():
+            self._observer.count_in_scene(scene_key, "retirements", count, reason.value)
 
     async def _end_all_outdated(self, options: AdoptionOptions) -> None:
         outdated_in = await asyncio.to_thread(adoption.list_outdated_scenes, self._store.database)

@@ -1,7 +1,7 @@
 """Localizes photographs a second time, from surveyed references alone: all that were not adopted."""
 
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,6 +91,15 @@ class SurveyedLocalizer:
         return Place(
             ids, keys, viewpoints.centres[chosen], viewpoints.axes[chosen], [chosen.index(it) for it in around]
         )
+
+    def place_keys(self, scene_key: SceneKey, poses: Mapping[str, RigidTransform]) -> dict[str, str]:
+        """Keys of the surveyed references whose places poses are at, by the names of these; none without surveyed."""
+        entries = self._entries(scene_key)
+        rows, viewpoints = self._surveyed(scene_key, entries)
+        if not len(rows):
+            return {}
+        nearest = {name: viewpoints.place(it.translation, it.rotation[:, 2]) for name, it in poses.items()}
+        return {name: entries.reference(int(rows[it]))[1] for name, it in nearest.items()}
 
     def surveyed_again(self, scene_key: SceneKey, new_keys: Collection[str], options: AdoptionOptions) -> set[str]:
         """Keys of the surveyed references around which new ones stand."""

@@ -119,6 +119,7 @@ _RETIRED_BECAUSE = {
     RetirementReason.SURVEY_OUTDATED: "photographs of its place show too little of what was surveyed: survey it again",
     RetirementReason.VOUCHERS_GONE: "the surveyed references that its pose rests on are not in the scene: "
     "they were deleted or retired, or never stored",
+    RetirementReason.PLACE_FULL: "its place has as many adopted references as it may, which are more useful",
     RetirementReason.BY_OPERATOR: "by request of a caller who may change the scene",
 }
 
