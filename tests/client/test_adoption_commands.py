@@ -89,8 +89,10 @@ def test_a_reference_is_retired_and_restored_by_command(run: Run, client: Client
         assert run("reference", "retire", scene, it) == (0, f"{it} is not chosen for photographs any more\n", "")
     assert "by request" in run("reference", "list", scene, "--retired")[1]
     code, text, _ = run("reference", "restore", scene, "--place", "r1", "--since", "2026-01-01")
-    assert (code, text.splitlines()) == (0, ["1 reference chosen for photographs again", "  r1"])
-    assert "1 reference" in run("reference", "restore", scene, "--all")[1]
+    forgotten = "what photographs said of places that needed a new survey is forgotten"
+    assert (code, text.splitlines()) == (0, ["1 reference chosen for photographs again", "  r1", forgotten])
+    assert "1 reference" in (text := run("reference", "restore", scene, "--all")[1])
+    assert forgotten in text
     assert list(client.list_references(scene, only_retired=True)) == []
 
 

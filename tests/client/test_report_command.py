@@ -141,6 +141,7 @@ def test_a_scene_without_photographs_says_so(run: Run, scene: str) -> None:
         (["--alert-below", "90"], "must be 0 to 1"),
         (["--until", "0001-01-01"], "must be 1970-01-01 or later"),
         (["--until", "9999-01-01"], "--until 9999-01-01 is after today"),
+        (["--since", "9999-01-01"], "--since 9999-01-01 is after today"),
         (["--since", "2026-03-02", "--until", "2026-03-01"], "--since 2026-03-02 is after --until 2026-03-01"),
     ],
 )

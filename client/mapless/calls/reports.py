@@ -26,7 +26,8 @@ async def get_scene_report(
     Args:
         scene: the scene.
         first_day: UTC; None such that there are four periods.
-        last_day: UTC, less than 4000 days later; None for today.
+        last_day: UTC, less than 4000 days later; None for today, by the server's clock. Days to come have no
+            photographs; the command line refuses them.
         days_per_period: days that are counted together, 1 to 366; the last period ends with the last day.
         timeout_s: deadline of the call.
     """

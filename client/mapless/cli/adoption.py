@@ -11,6 +11,7 @@ from .folder import EXIT_FAILED
 from .output import is_confirmed, show, table
 
 _POLICY = "values that are not given stay as the scene has them, at first the defaults"
+_FORGOTTEN = "what photographs said of places that needed a new survey is forgotten"
 
 
 def add_policy(command: argparse.ArgumentParser) -> None:
@@ -69,7 +70,12 @@ def add_actions(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     retire.add_argument("scene")
     retire.add_argument("reference")
     retire.set_defaults(run=retire_reference)
-    restore = actions.add_parser("restore", help="have a retired one chosen again, or all, or some")
+    restore = actions.add_parser(
+        "restore",
+        help="have a retired one chosen again, or all, or some",
+        description=f"With --all, and at the place of --place, {_FORGOTTEN}, "
+        "and so the evidence that these are outdated. Where that is right, use --since alone.",
+    )
     restore.add_argument("scene")
     restore.add_argument("reference", nargs="?", default="")
     restore.add_argument("--all", action="store_true", help="all retired ones of the scene")
@@ -114,6 +120,8 @@ def restore_references(client: Client, arguments: argparse.Namespace) -> int:
         done = client.restore_references(arguments.scene, since=arguments.since, place=arguments.place)
         ids, still = done.reference_ids, done.still_retired
         lines = [f"{_number(len(ids))} chosen for photographs again", *(f"  {it}" for it in ids)]
+        if arguments.place or arguments.since is None:
+            lines.append(_FORGOTTEN)
         if still:
             lines += [f"{_number(len(still))} still retired", *(f"  {it}: {why}" for it, why in still.items())]
         return show(arguments, done, lines)

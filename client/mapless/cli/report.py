@@ -36,7 +36,9 @@ def add_report(actions: "argparse._SubParsersAction[argparse.ArgumentParser]") -
     begin = report.add_mutually_exclusive_group()
     begin.add_argument("--weeks", type=_weeks, metavar="N", help=f"so many weeks (default: {DEFAULT_WEEKS})")
     begin.add_argument("--since", type=day_of, metavar="DAY", help="first day, such as 2026-11-02, instead of --weeks")
-    report.add_argument("--until", type=day_of, metavar="DAY", help="last day (default: today)")
+    report.add_argument(
+        "--until", type=day_of, metavar="DAY", help="last day, at most today, by the server's clock (default)"
+    )
     report.add_argument("--by-day", action="store_true", help="count days instead of weeks")
     report.add_argument(
         "--alert-below",
@@ -82,11 +84,9 @@ def scene_report(client: Client, arguments: argparse.Namespace) -> int:
     first_day, last_day = arguments.since, arguments.until
     if first_day is not None and last_day is not None and first_day > last_day:
         raise ValueError(f"--since {first_day} is after --until {last_day}")
-    if last_day is not None or arguments.weeks is not None or arguments.by_day:
+    if first_day is not None or last_day is not None or arguments.weeks is not None or arguments.by_day:
         today = client.get_scene_report(arguments.scene, days_per_period=1).last_day
-        if first_day is None:
-            first_day = first_day_of(arguments.weeks or DEFAULT_WEEKS, last_day or today)
-        last_day = last_day_of(last_day, today)
+        first_day, last_day = days_of(arguments.weeks or DEFAULT_WEEKS, first_day, last_day, today)
     report = client.get_scene_report(
         arguments.scene,
         first_day=first_day,
@@ -98,17 +98,16 @@ def scene_report(client: Client, arguments: argparse.Namespace) -> int:
     return EXIT_REJECTED if to_do else 0
 
 
-def first_day_of(weeks: int, last_day: date) -> date:
-    """First of so many weeks; at the earliest that of the first day that a report can have."""
-    days = min(7 * weeks - 1, (last_day - EPOCH).days)
-    return last_day - timedelta(days)
+def days_of(weeks: int, since: date | None, until: date | None, today: date) -> tuple[date, date]:
+    """First and last day of a report: so many weeks, or from a day on, until today, the server's day, or before.
 
-
-def last_day_of(wanted: date | None, today: date) -> date:
-    """The last day of a report, today unless another is wanted; ValueError for one after today, the server's day."""
-    if wanted is not None and wanted > today:
-        raise ValueError(f"--until {wanted} is after today, {today} by the server's clock (UTC)")
-    return wanted or today
+    ValueError names the flag of a day after today. The first is at the earliest the first that a report can have.
+    """
+    for flag, day in (("--since", since), ("--until", until)):
+        if day is not None and day > today:
+            raise ValueError(f"{flag} {day} is after today, {today} by the server's clock (UTC)")
+    last_day = until or today
+    return since or last_day - timedelta(min(7 * weeks - 1, (last_day - EPOCH).days)), last_day
 
 
 def work_of(report: SceneReport, least_localized_share: float) -> list[str]:

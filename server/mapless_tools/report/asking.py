@@ -3,7 +3,7 @@
 from datetime import date
 
 from mapless import Client
-from mapless.cli.report import first_day_of, last_day_of
+from mapless.cli.report import days_of
 from mapless.scene_reports import SceneReport
 
 
@@ -12,7 +12,8 @@ def report_of_weeks(
 ) -> SceneReport:
     """The report of so many weeks, or from the first day on.
 
-    They end with the last day or, if it is None, with today by the server's clock. ValueError for one after that.
+    They end with the last day or, if it is None, with today by the server's clock. ValueError for days after that.
     """
-    last = last_day_of(last_day, client.get_scene_report(scene, days_per_period=1).last_day)
-    return client.get_scene_report(scene, first_day=first_day or first_day_of(weeks, last), last_day=last)
+    today = client.get_scene_report(scene, days_per_period=1).last_day
+    first, last = days_of(weeks, first_day, last_day, today)
+    return client.get_scene_report(scene, first_day=first, last_day=last)
