@@ -20,10 +20,11 @@ from mapless import Reference, RigidTransform, Scene
 from mapless.answers import Accuracy
 from mapless.geometry import Camera, rotation_from_vector
 from mapless.provenance import ADOPTED, Provenance, Voucher
+from mapless.rejections import WORDS
 from mapless.results import PlaceState
 from mapless.scene_reports import PeriodCounts, PlaceReport, ReferenceSuggestion, RejectedPosition, SceneReport
 from mapless_tools.cli.app import app
-from mapless_tools.report.drawing import Seen, plan_axes, plan_svg, ring_radius
+from mapless_tools.report.drawing import Seen, outcomes_figure, plan_axes, plan_svg, ring_radius
 from mapless_tools.report.page import _shown, report_page
 from mapless_tools.report.places import BAD, FAIR, GOOD, NONE, REASONS, Place, floor_of, floors_of, places_of
 
@@ -222,6 +223,12 @@ class TestPage:
         places = [place(f"p{i}", it, 1, {}) for i, it in enumerate(poses)]
         html = report_page(report(*places), replace(SCENE, down_in_world=None), [])
         assert "the direction in which references are spread least" in html
+
+
+def test_a_legend_of_all_reasons_is_within_its_chart() -> None:
+    figure = outcomes_figure([counts(1, dict.fromkeys(WORDS, 1))])
+    figure.draw_without_rendering()
+    assert figure.legends[0].get_window_extent().x1 < figure.bbox.x1
 
 
 class TestCommand:

@@ -5,6 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,6 +33,8 @@ _ARROWS_PT, _NUMBER_PT = (26, 36, 46, 56, 66), 9
 radius, covers no ring."""
 _MOST_DAYS = 10
 """Days that are named at an axis."""
+_LEGEND = 36
+"""Characters of a line of a legend, two columns of which are as wide as a chart."""
 LOCALIZED = COLOURS[0]
 
 
@@ -232,6 +235,11 @@ def _arc(first: float, last: float, steps: int) -> Array:
 
 def outcomes_svg(periods: Sequence[PeriodCounts]) -> str:
     """Photographs of each period, stacked by outcome, as SVG."""
+    return inline_svg(outcomes_figure(periods))
+
+
+def outcomes_figure(periods: Sequence[PeriodCounts]) -> Figure:
+    """The chart of `outcomes_svg`."""
     axes = new_axes("Photographs by outcome", "first day", "photographs")
     at, base = np.arange(len(periods)), np.array([it.localized_count for it in periods], float)
     axes.bar(at, base, 0.8, color=LOCALIZED, label="localized")
@@ -241,11 +249,11 @@ def outcomes_svg(periods: Sequence[PeriodCounts]) -> str:
             totals[reason] = totals.get(reason, 0) + count
     for reason in sorted(totals, key=lambda it: (-totals[it], it)):
         counts = np.array([it.rejections.get(reason, 0) for it in periods], float)
-        axes.bar(at, counts, 0.8, base, color=reason_colour(reason), label=explained(reason))
+        axes.bar(at, counts, 0.8, base, color=reason_colour(reason), label=fill(explained(reason), _LEGEND))
         base = base + counts
     axes.set_ylim(0, max(1.0, 1.05 * float(base.max())))
     _name_days(axes, periods)
-    return inline_svg(figure_of(axes))
+    return figure_of(axes)
 
 
 def ageing_svg(periods: Sequence[PeriodCounts]) -> str:
