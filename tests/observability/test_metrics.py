@@ -4,6 +4,7 @@ import asyncio
 import math
 import re
 import socket
+import sys
 import threading
 import time
 import urllib.error
@@ -11,6 +12,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from types import ModuleType
 
 import pytest
 from prometheus_client import generate_latest
@@ -21,7 +23,7 @@ from mapless_server.method.rejection import RejectionReason
 from mapless_server.observability import exporter
 from mapless_server.observability.exporter import MAX_CONNECTIONS, MetricsServer
 from mapless_server.observability.metrics import COUNTED, LOCALIZED, STAGES, Metrics
-from mapless_server.observability.scraped import SceneAge
+from mapless_server.observability.scraped import SceneAge, gpu_memory
 from mapless_server.scheduling import Ending, Refusal, StageLoad
 
 LOCALIZE = "/mapless.v1.LocalizationService/Localize"
@@ -371,3 +373,8 @@ def test_the_port_answers_while_the_event_loop_is_blocked(server: MetricsServer)
             return pool.submit(scrape, server.port).result(30)  # waited for on the loop's own thread
 
     assert "mapless_fatal_total" in asyncio.run(block())
+
+
+def test_no_gpu_is_sought_while_torch_is_being_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", ModuleType("torch"))
+    assert gpu_memory() == {}

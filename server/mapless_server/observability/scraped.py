@@ -175,10 +175,9 @@ def _gauge(metrics: dict[str, Metric], name: str, text: str, labels: Iterable[st
 
 def gpu_memory() -> dict[str, float]:
     """Memory of the CUDA device in use, bytes by kind; empty without one. Does not import torch."""
-    torch = sys.modules.get("torch")
-    if torch is None or not torch.cuda.is_initialized():
+    cuda = getattr(sys.modules.get("torch"), "cuda", None)  # not there yet while another thread imports torch
+    if cuda is None or not cuda.is_initialized():
         return {}
-    cuda = torch.cuda
     return {
         "allocated": cuda.memory_allocated(),
         "reserved": cuda.memory_reserved(),
