@@ -228,7 +228,7 @@ def _learned(held: Held, candidate: Candidate, share: float, day: int) -> None:
 
 
 def test_ones_own_photographs_keep_no_place_full(held: Held) -> None:
-    """What one token put there is only proved useful by photographs of others; a new one is worth 0.2."""
+    """Only photographs of others prove what one token put there useful; a new one is worth 0.2."""
     robot = replace(held.candidate(held.place.queries[0]), holder="robot")
     assert held.consider(robot) is None
     (only,) = adoption.list_adopted(held.store.database, ROOM)
@@ -258,7 +258,7 @@ def _without_survey(answered: Candidate) -> Candidate:
 
 
 def test_a_robot_that_stands_still_outdates_nothing(held: Held) -> None:
-    """What was adopted where it stands gives its photographs most of their matches, and nothing has changed."""
+    """A reference adopted where it stands gives its photographs most of their matches, and nothing has changed."""
     query = held.place.queries[2]
     assert held.consider(held.candidate(query)) is None
     candidate = held.candidate(_noisy(query))

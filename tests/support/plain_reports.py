@@ -23,7 +23,7 @@ NAMES = tuple(it.name for it in fields(Sums))
 
 
 def stored_counts(store: Store, scene_key: SceneKey, first_day: int, last_day: int) -> dict[CountKey, Sums]:
-    """What is counted of a scene in some days, also what is no answer."""
+    """Counts of a scene in some days, also of what is no answer."""
     column = scene_count.c
     found = select(scene_count).where(column.scene_id == scene_key, column.day.between(first_day, last_day))
     with store.database.read() as connection:

@@ -1,4 +1,4 @@
-"""What receives the calls of a running server: gRPC at its address, whose limits are set here."""
+"""Receives the calls of a running server: gRPC at its address, whose limits are set here."""
 
 from __future__ import annotations
 

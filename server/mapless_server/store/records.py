@@ -93,7 +93,7 @@ class RetirementReason(str, Enum):
     VOUCHERS_GONE = "vouchers_gone"
     """The surveyed references that the pose of an adopted one rests on were deleted or retired."""
     PLACE_FULL = "place_full"
-    """Of an adopted one: its place changed, and the new one has as many as it may, which are more useful."""
+    """An adopted one got another place, which has as many as it may, all more useful."""
     BY_OPERATOR = "by_operator"
     """A caller who may change the scene has asked for it."""
 

@@ -127,7 +127,7 @@ def read_report(database: Database, scene_key: SceneKey, days: Days, half_life_d
 
 
 class ReportReader:
-    """What the store has of a scene's answers, at one moment: that of the connection's transaction."""
+    """Reads counts of a scene's answers, all as of one moment: that of the connection's transaction."""
 
     def __init__(self, connection: Connection, scene_key: SceneKey, days: Days, half_life_days: float) -> None:
         """Makes the object; arguments as those of `read_report`."""

@@ -1,4 +1,4 @@
-"""What a photograph shows that its references lack: real places, with parts of photographs exchanged for another place.
+"""Photographs that show something new: real places, with parts of photographs exchanged for another place.
 
 The photograph's right part is that of a photograph of the next place; it is localized with SIFT in this process.
 """

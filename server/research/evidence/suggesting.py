@@ -1,4 +1,4 @@
-"""Which places reports suggest for further references: a model of a building whose places change.
+"""Suggestions of places for further references: a model of a building whose places change.
 
 Forty places are photographed, some often and some seldom. A place changes now and then, for some days or until it is
 surveyed, and then a share of its photographs is rejected that further references would rescue; at each place some
@@ -30,7 +30,7 @@ CHANGES, LACKING = 0.005, (0.2, 0.9)
 SHORT_DAYS, LONG_DAYS = 10.0, 60.0
 """Mean times of changes: half are short, half last until the place is surveyed, from when on it counts anew."""
 AT_FAULT = (0.5, 9.5)
-"""Of a beta distribution: the share of a place's photographs that are rejected by their own fault."""
+"""Parameters of a beta distribution: the share of a place's photographs that are rejected by their own fault."""
 HALF_LIVES = (2, 4, 7, 14, 28, 56, 10_000)
 LEAST = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
